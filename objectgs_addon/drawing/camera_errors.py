@@ -8,7 +8,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..scene import uncertain_cameras
+from ..scene import is_in_file, uncertain_cameras
 
 _YELLOW, _RED = np.array((1.0, 0.8, 0.1, 1.0)), np.array((1.0, 0.15, 0.05, 1.0))
 _WIDTH = 2.5
@@ -22,7 +22,7 @@ _handler = None
 def _draw() -> None:
     context = bpy.context
     space = context.space_data
-    if not (space.overlay.show_overlays and space.overlay.show_extras):
+    if not (space.overlay.show_overlays and space.overlay.show_extras and is_in_file()):
         return
     lines, colors = [], []
     for camera, uncertainty in uncertain_cameras(context.view_layer, space):

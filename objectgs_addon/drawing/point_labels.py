@@ -8,7 +8,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..scene import shown_points
+from ..scene import is_in_file, shown_points
 from .splat_arrays import Labels, point_labels
 
 _SIZE = 6.0
@@ -28,6 +28,8 @@ def _shader() -> gpu.types.GPUShader:
 
 def _draw() -> None:
     context = bpy.context
+    if not is_in_file():
+        return
     for part in shown_points(context.view_layer, context.space_data):
         labels = point_labels(part.data)
         if labels is None:

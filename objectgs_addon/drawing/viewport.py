@@ -12,6 +12,7 @@ import numpy as np
 from ...backend.shared.color import srgb
 from ...backend.shared.splats.picking import View
 from ..blender import writing
+from ..scene import is_in_file
 from ..scene.shading.modifiers import show_preview
 from . import gather
 from .renderer import Renderer
@@ -63,7 +64,7 @@ def _draw() -> None:
     context = bpy.context
     space, region = context.space_data, context.region_data
     properties = context.scene.objectgs
-    if not properties.draw_splats or region is None or _failure is not None:
+    if not properties.draw_splats or region is None or _failure is not None or not is_in_file():
         return
     try:
         renderer()
@@ -134,7 +135,7 @@ def redraw(_properties: Any = None, _context: bpy.types.Context = None) -> None:
 @writing.allowed
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
     """Switch off the preview of new splats."""
-    if _is_drawn(scene.objectgs):
+    if _is_drawn(scene.objectgs) and is_in_file():
         for part in gather.carriers(scene):
             show_preview(part, False)
 

@@ -13,6 +13,7 @@ import bpy
 
 from ...backend.shared.formats.file_names import file_stem
 from ...backend.shared.formats.photos_source import PhotosSource, read_source
+from ...backend.shared.formats.regular_file import is_file
 from ..process.backend_process import backend_command, backend_environment
 from ..process.jobs import Job
 from . import environment, online_access
@@ -84,7 +85,7 @@ def backend_python() -> Path | None:
     """Return the backend's Python: the user's choice, else that of the environment; None if it is not usable."""
     chosen = _chosen_python()
     if chosen is not None:
-        return chosen if chosen.is_file() else None
+        return chosen if is_file(chosen) else None
     state = environment.inspect(environment_folder())
     return state.python if state.state == "ready" else None
 
@@ -94,7 +95,7 @@ def backend_sentence() -> str:
     chosen = _chosen_python()
     if chosen is None:
         return environment.inspect(environment_folder(), online_access.remedy()).sentence
-    if chosen.is_file():
+    if is_file(chosen):
         return f"The backend is at {chosen}."
     return f"The backend's Python {chosen} does not exist; choose another, or clear the field."
 

@@ -19,6 +19,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.objects import is_singular
 from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
 from ..scene.capture import origin_of
 from ..scene.kinds import MESH, OBJECT_PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
@@ -291,9 +292,9 @@ def _sample(
     objects: dict[int, list[np.ndarray]] = {}
     for instance in instances:
         if instance.is_seen():
-            objects.setdefault(instance.object_id, []).append(
-                transform.map_from(instance.world(), center_of(instance.pivot))
-            )
+            place = transform.map_from(instance.world(), center_of(instance.pivot))
+            if not is_singular(place):
+                objects.setdefault(instance.object_id, []).append(place)
     camera = scene.camera
     if camera is None or camera.type != "CAMERA":
         raise InputError(f"The scene {scene.name} has no camera at frame {time:g}; choose one.")

@@ -6,6 +6,7 @@ They are properties of the reconstruction's collection, so that undo removes a s
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 from collections.abc import Callable, Sequence
@@ -36,8 +37,14 @@ def strokes_changed(properties: Any, _context: bpy.types.Context = None) -> None
 
 def strokes_of(root: bpy.types.Collection) -> list[dict[str, Any]]:
     """Return the strokes in the form of the backend's files of strokes."""
+    return list(_parsed(root.objectgs.strokes))
+
+
+@functools.lru_cache(maxsize=4)
+def _parsed(text: str) -> list[dict[str, Any]]:
+    """Return the strokes in a text; cached, since panels ask for them in each row of a list."""
     try:
-        found = json.loads(root.objectgs.strokes or "[]")
+        found = json.loads(text or "[]")
     except ValueError:
         return []
     return found if isinstance(found, list) else []

@@ -47,10 +47,14 @@ class PointPicker:
         context.area.tag_redraw()
 
     def end(self, context: bpy.types.Context) -> None:
-        """Restore the cursor and the status bar."""
-        bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
-        context.window.cursor_modal_restore()
-        self.show_status(context, None)
+        """Restore the cursor and the status bar, where these are still there."""
+        if self._handler is not None:
+            bpy.types.SpaceView3D.draw_handler_remove(self._handler, "WINDOW")
+            self._handler = None
+        if context.window is not None:
+            context.window.cursor_modal_restore()
+        if context.workspace is not None and context.area is not None:
+            self.show_status(context, None)
 
     def pick(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
         """Add the point under the mouse; return False if there is none."""

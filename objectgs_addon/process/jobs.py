@@ -111,9 +111,18 @@ class Job:
     _stop_asked: float | None = field(default=None, repr=False)
     _kill_at: float | None = field(default=None, repr=False)
 
-    def again(self) -> Job:
-        """Return a new job of the same program."""
-        return Job(self.title, self.kind, self.folder, self.command, self.cwd, self.environment, self.if_silent)
+    def again(self, python: Path | None) -> Job:
+        """Return a new job of the same program, where a training goes on from its last checkpoint.
+
+        Args:
+            python: the backend's present Python, or None.
+        """
+        command = list(self.command)
+        if python is not None and command[1:3] == ["-m", "backend"]:
+            command[0] = str(python)
+        if self.kind == "train" and self.step is not None:
+            command = [word for word in command if word != "--restart"]
+        return Job(self.title, self.kind, self.folder, command, self.cwd, self.environment, self.if_silent)
 
     @property
     def _child(self) -> BackendProcess:

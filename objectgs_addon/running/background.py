@@ -263,7 +263,7 @@ def _go_on(job: Job, owner: bpy.types.Scene | None) -> None:
     if failed is None or owner is None:
         messages.show(job.message)
     else:
-        submit(failed.again(), owner, lambda _kind, text: messages.show(text, "ERROR"))
+        submit(failed.again(locations.backend_python()), owner, lambda _kind, text: messages.show(text, "ERROR"))
 
 
 def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:

@@ -13,8 +13,18 @@ import bpy
 from ...backend.shared.errors import InputError
 from .. import scene
 from ..blender import messages, writing
-from ..state import folder_trust, object_edits, splat_edits
+from ..state import folder_trust, object_edits, object_list, splat_edits
 from . import background, pointing, results
+
+_before: dict[int, object_list.State] = {}
+"""Session UID of a reconstruction -> its state before the undo or redo that is going on."""
+
+
+@bpy.app.handlers.persistent
+def _undoing(*_: Any) -> None:
+    """Remember what undo or redo may change."""
+    _before.clear()
+    _before.update({root.session_uid: object_list.state_of(root) for root in _accepted_roots()})
 
 
 @bpy.app.handlers.persistent
@@ -22,8 +32,9 @@ from . import background, pointing, results
 def _undone(*_: Any) -> None:
     """Update the folder's edits and the fills after undo or redo."""
     for root in _accepted_roots():
+        store = partial(object_edits.store, before=_before.pop(root.session_uid, object_list.State({}, {})))
         fill_holes = partial(background.fill_holes, again=False)
-        for action in (object_edits.store, splat_edits.follow, results.show_fill, fill_holes, pointing.refresh):
+        for action in (store, splat_edits.follow, results.show_fill, fill_holes, pointing.refresh):
             _try(action, root)
 
 
@@ -42,7 +53,7 @@ def _accepted_roots() -> list[bpy.types.Collection]:
     return [
         root
         for root in bpy.data.collections
-        if scene.kind_of(root) == "reconstruction" and root.library is None and folder_trust.is_accepted(root)
+        if scene.kind_of(root) == "reconstruction" and not scene.is_linked(root) and folder_trust.is_accepted(root)
     ]
 
 
@@ -77,13 +88,17 @@ def register() -> None:
     object_edits.after_edits.append(background.fill_holes)
     bpy.app.handlers.load_post.append(_file_loaded)
     bpy.app.handlers.save_pre.append(_saving)
-    bpy.app.handlers.undo_post.append(_undone)
-    bpy.app.handlers.redo_post.append(_undone)
+    for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
+        handlers.append(_undoing)
+    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        handlers.append(_undone)
 
 
 def unregister() -> None:
-    bpy.app.handlers.redo_post.remove(_undone)
-    bpy.app.handlers.undo_post.remove(_undone)
+    for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        handlers.remove(_undone)
+    for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
+        handlers.remove(_undoing)
     bpy.app.handlers.save_pre.remove(_saving)
     bpy.app.handlers.load_post.remove(_file_loaded)
     object_edits.after_edits.remove(background.fill_holes)

@@ -35,7 +35,7 @@ def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
         for collection in bpy.data.collections
         if scene.kind_of(collection) == "reconstruction"
         and scene.folder_of(collection) == folder
-        and collection.library is None
+        and not scene.is_linked(collection)
     ]
 
 
@@ -163,6 +163,21 @@ def _show_masks(job: Job, _owner: bpy.types.Scene | None) -> bool:
     return False
 
 
+def _tell_export(job: Job, _owner: bpy.types.Scene | None) -> bool:
+    """Tell what was written; return False."""
+    count, files, out = (job.result.get(key) for key in ("splats", "files", "exported"))
+    if isinstance(count, int) and isinstance(files, int):
+        where = f"{out}" if files == 1 else f"{files} files in {out}"
+        messages.show(" ".join([f"Wrote {count:,} splats to {where}.", *map(in_blender, job.warnings)]))
+    return False
+
+
+def _tell_check(job: Job, _owner: bpy.types.Scene | None) -> bool:
+    """Tell how the backend works; return False."""
+    messages.show(in_blender(job.message))
+    return False
+
+
 SHOW_BY_KIND = {
     "import": _show_capture,
     "masks": _show_masks,
@@ -173,4 +188,6 @@ SHOW_BY_KIND = {
     "film": _show_film,
     "import-splats": _show_imported,
     "fill": _show_fill_job,
+    "export": _tell_export,
+    "doctor": _tell_check,
 }

@@ -10,7 +10,7 @@ from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_
 from .edits.floaters import floater_counts, floating_splats, hidden_splats
 from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
-from .edits.show import is_removed, recolor, reset_placement, show_edits, store_placements
+from .edits.show import Places, is_removed, places_of, recolor, reset_placement, show_edits, store_placements
 from .edits.single_splats import (
     ShownEdits,
     delete_splats,
@@ -26,6 +26,7 @@ from .kinds import (
     duplicates_of,
     folder_of,
     from_stored,
+    is_in_file,
     is_linked,
     kind_of,
     link_folder,
@@ -61,6 +62,7 @@ __all__ = [
     "SHOWS",
     "UNOBSERVED_COUNT",
     "Objects",
+    "Places",
     "Shown",
     "ShownEdits",
     "ShownMeshes",
@@ -82,6 +84,7 @@ __all__ = [
     "from_stored",
     "has_shown_meshes",
     "hidden_splats",
+    "is_in_file",
     "is_linked",
     "is_removed",
     "is_untouched",
@@ -99,6 +102,7 @@ __all__ = [
     "orient_to_ground",
     "parts_of",
     "placement_of",
+    "places_of",
     "point_numbers",
     "prepare_render",
     "recolor",

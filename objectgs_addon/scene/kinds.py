@@ -44,6 +44,11 @@ def kind_of(block: bpy.types.ID) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
+def is_in_file() -> bool:
+    """Return whether the .blend has anything of a reconstruction; other files need no look at all their objects."""
+    return any(KIND in block for blocks in (bpy.data.collections, bpy.data.node_groups) for block in blocks)
+
+
 def is_linked(block: bpy.types.ID) -> bool:
     """Return whether another .blend holds a data-block, linked or overridden, so that changes are not saved."""
     return block.library is not None or block.override_library is not None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import bpy
 
+from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import STROKES
 from .. import scene
 from ..environment import known_folders, locations
@@ -115,4 +116,4 @@ def has_masks(state: FolderState) -> bool:
     capture = state.capture
     if capture is None or (known_folders.is_remote(capture) and not known_folders.is_known(capture)):
         return False
-    return (capture / "masks").is_dir()
+    return is_folder(capture / "masks")

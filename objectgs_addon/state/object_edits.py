@@ -81,51 +81,38 @@ def fill(root: bpy.types.Collection) -> None:
         properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
 
 
-def store(root: bpy.types.Collection) -> None:
-    """Write the list and the transforms to objects.json after an undo or redo."""
+def store(root: bpy.types.Collection, before: object_list.State) -> None:
+    """Write to objects.json what an undo or redo has changed in the list and in the places of objects.
+
+    What it has not changed is left as it is there, since another scene or program may have written it.
+    """
     _unwritten.difference_update([mark for mark in _unwritten if mark[0] == root.session_uid])
     path = Reconstruction(scene.folder_of(root)).objects
     if not folder_trust.is_accepted(root) or not path.exists():
         return
     entries = {entry.id: entry for entry in read_objects(path)}
-    items = {from_stored(item.object_id): item for item in root.objectgs.objects}
-    if {i for i, item in items.items() if not item.separated} != {i for i in entries if not entries[i].separated}:
+    rows = object_list.state_of(root).rows
+    if {i for i in rows if not rows[i]["separated"]} != {i for i in entries if not entries[i].separated}:
         return
-    changes: dict[int, dict] = {i: dict.fromkeys(EDITABLE) for i in entries.keys() - items.keys()}
-    for object_id, item in items.items():
-        entry = entries.get(object_id, SceneObject(object_id, "", (0, 0, 0), 0))
-        wanted = {
-            "name": item.name,
-            "color": _rgb(item),
-            "left_out": None if item.chosen else True,
-            "merged_into": from_stored(item.merged_into) if item.is_merged else None,
-            "removed": item.removed or None,
-            "floaters": item.floaters or None,
-            "fill": item.fill or None,
-            "cleaned": item.cleaned or None,
-            "recolor": object_list.recolor_of(item).stored(),
-            "separated": item.separated or None,
+    gone = (entries.keys() & before.rows.keys()) - rows.keys()
+    changes: dict[int, dict] = {object_id: dict.fromkeys(EDITABLE) for object_id in gone}
+    for object_id, row in rows.items():
+        there = entries.get(object_id, SceneObject(object_id, "", (0, 0, 0), 0))
+        stored = {name: getattr(there, name) or None for name in row} | {
+            "color": list(there.color), "merged_into": there.merged_into,
+            "recolor": object_list.rounded(there.recolor).stored(),
+        }  # fmt: skip
+        was = before.rows.get(object_id)
+        changed = {
+            key: value for key, value in row.items() if value != stored[key] and (was is None or value != was[key])
         }
-        there = {
-            "name": entry.name,
-            "color": list(entry.color),
-            "left_out": entry.left_out or None,
-            "merged_into": entry.merged_into,
-            "removed": entry.removed or None,
-            "floaters": entry.floaters or None,
-            "fill": entry.fill or None,
-            "cleaned": entry.cleaned or None,
-            "recolor": object_list.rounded(entry.recolor).stored(),
-            "separated": entry.separated or None,
-        }
-        changed = {key: value for key, value in wanted.items() if value != there[key]}
         if changed:
             changes[object_id] = changed
     if changes:
         edit_objects(path, changes)
-    for item in items.values():
+    for item in root.objectgs.objects:
         _remember(item)
-    scene.store_placements(root, everything=True)
+    scene.store_placements(root, before.places)
 
 
 def store_edits(root: bpy.types.Collection) -> None:
@@ -291,7 +278,7 @@ def flush() -> None:
         return
     _unwritten.clear()
     for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
-        if not folder_trust.is_accepted(root):
+        if scene.is_linked(root) or not folder_trust.is_accepted(root):
             continue
         items = [item for item in root.objectgs.objects if (root.session_uid, from_stored(item.object_id)) in waiting]
         if items:
@@ -319,10 +306,6 @@ def _set_sliders(item: Any, recolor: Recolor | None) -> None:
     item.middle = wanted.middle if recolor is not None else 0.0
 
 
-def _rgb(item: Any) -> list[int]:
-    return [round(255 * channel) for channel in item.color]
-
-
 # Update callbacks of the rows' properties.
 
 
@@ -339,7 +322,7 @@ def name_changed(item: Any, _context: bpy.types.Context) -> None:
 
 
 def color_changed(item: Any, _context: bpy.types.Context) -> None:
-    _row_changed(item, color=_rgb(item))
+    _row_changed(item, color=object_list.rgb_of(item))
 
 
 def chosen_changed(item: Any, _context: bpy.types.Context) -> None:
@@ -380,7 +363,7 @@ def _row_changed(item: Any, **changes: Any) -> None:
     root = item.id_data
     folder = scene.folder_of(root)
     if not folder_trust.is_accepted(root):
-        red, green, blue = _rgb(item)
+        red, green, blue = object_list.rgb_of(item)
         scene.show_label(root, from_stored(item.object_id), item.name, (red, green, blue))
         return
     try:
@@ -421,7 +404,7 @@ def _kept(item: Any) -> dict[str, Any]:
     now = json.loads(json.dumps(object_list.recolor_of(item).stored()))
     return {
         **({"name": item.name} if item.name != name else {}),
-        **({"color": _rgb(item)} if list(item.color) != color else {}),
+        **({"color": object_list.rgb_of(item)} if list(item.color) != color else {}),
         **({"left_out": None if item.chosen else True} if item.chosen != chosen else {}),
         **({"recolor": now} if recolor and now != recolor[0] else {}),
     }
@@ -438,8 +421,8 @@ def _restore(item: Any) -> None:
 
 def active_changed(properties: Any, context: bpy.types.Context) -> None:
     """Select the clicked object of the list in the viewport."""
-    if _filling:
-        return
+    if _filling or context.mode != "OBJECT":
+        return  # Another active object would leave that in Edit Mode behind.
     root = properties.id_data
     item = object_list.active_item(root)
     if item is not None:

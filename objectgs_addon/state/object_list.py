@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Queries on the list of objects: rows, chosen objects, counts of splats and faces, and color edits."""
+"""Queries on the list of objects: rows, chosen objects, counts of splats and faces, color edits, and its state."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import bpy
 
@@ -107,3 +107,35 @@ def rounded(recolor: Recolor | None) -> Recolor:
     return Recolor(
         **values, **{name: tuple(round(channel, DIGITS) for channel in getattr(recolor, name)) for name in COLORS}
     )
+
+
+def rgb_of(item: Any) -> list[int]:
+    """Return the color of a row, sRGB 0 .. 255."""
+    return [round(255 * channel) for channel in item.color]
+
+
+class State(NamedTuple):
+    """The list of objects by ID, as fields of objects.json, and where the objects are."""
+
+    rows: dict[int, dict[str, Any]]
+    places: dict[int, scene.Places]
+
+
+def state_of(root: bpy.types.Collection) -> State:
+    """Return the present list and places, to be compared with those after an undo."""
+    rows = {
+        from_stored(item.object_id): {
+            "name": item.name,
+            "color": rgb_of(item),
+            "left_out": None if item.chosen else True,
+            "merged_into": from_stored(item.merged_into) if item.is_merged else None,
+            "removed": item.removed or None,
+            "floaters": item.floaters or None,
+            "fill": item.fill or None,
+            "cleaned": item.cleaned or None,
+            "recolor": recolor_of(item).stored(),
+            "separated": item.separated or None,
+        }
+        for item in root.objectgs.objects
+    }
+    return State(rows, scene.places_of(root))

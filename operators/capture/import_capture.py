@@ -32,6 +32,7 @@ class ImportCapture(ImportDialog, bpy.types.Operator):
         name="Save To",
         description="Path of the reconstruction folder, which may grow to gigabytes. If empty, it is named after the "
         "capture, in the folder set in the preferences",
+        options={"SKIP_SAVE"},
     )
     max_size: image_size()
 

@@ -36,6 +36,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         name="Save To",
         description="Path of the folder for a copy of the photos with their cameras. If empty, it is named after the "
         "photos' folder, in the folder set in the preferences",
+        options={"SKIP_SAVE"},
     )
     cameras: EnumProperty(
         name="Cameras",
@@ -50,6 +51,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         name="Calibration",
         description="Path of COLMAP's cameras.bin or cameras.txt, or of its folder, if the lenses are known: a camera "
         "for each size of photos. If empty, lenses are computed, too",
+        options={"SKIP_SAVE"},
     )
     features: EnumProperty(
         name="Features",

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Open a reconstruction folder in the scene, and accept the one that a .blend names."""
 
+import os
 from pathlib import Path
 
 import bpy
@@ -41,15 +42,22 @@ class OpenReconstruction(bpy.types.Operator):
             (
                 collection
                 for collection in context.scene.collection.children_recursive
-                if scene.kind_of(collection) == "reconstruction" and scene.folder_of(collection) == folder
+                if scene.kind_of(collection) == "reconstruction" and _is_same(scene.folder_of(collection), folder)
             ),
             None,
         )
+        if root is not None:
+            folder = scene.folder_of(root)
         if root is None and self.instead:
             root = need.active_root(context)
         if root is not None and folder_trust.is_in_question(root) and folder == folder_trust.offered(root):
             object_edits.accept(root, folder)
         show_folder(self, context, folder, root)
+
+
+def _is_same(first: Path, second: Path) -> bool:
+    """Return whether two paths lead to the same folder, by symbolic links or names of drives."""
+    return os.path.normcase(os.path.realpath(first)) == os.path.normcase(os.path.realpath(second))
 
 
 class UseFolder(bpy.types.Operator):

@@ -21,18 +21,13 @@ class _PicksPoints:
     where = ""
 
     points: Any
-    picker: point_picker.PointPicker
+    picker: point_picker.PointPicker | None = None
     report: Any
     poll_message_set: Any
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        if not need.shown(cls, context):
-            return False
-        if context.mode == "OBJECT":
-            return True
-        cls.poll_message_set("Switch to Object Mode first")
-        return False
+        return need.shown(cls, context) and need.object_mode(cls, context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if context.area is None or context.area.type != "VIEW_3D":
@@ -61,6 +56,11 @@ class _PicksPoints:
                 return self.finish(context)
             self.picker.show_status(context, self._text())
         return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End picking if the window is closed or another file is opened."""
+        if self.picker is not None:
+            self.picker.end(context)
 
     def finish(self, context: bpy.types.Context) -> set[str]:
         """Use the points once all are picked."""
@@ -102,10 +102,17 @@ class SetDistance(_PicksPoints, bpy.types.Operator):
     count = 2
     where = "of a known distance"
 
-    def finish(self, context: bpy.types.Context) -> set[str]:
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.properties.is_property_set("points"):
+            return context.window_manager.invoke_props_dialog(self)
+        return super().invoke(context, event)
+
+    def finish(self, _context: bpy.types.Context) -> set[str]:
         first, second = self._points()
-        self.distance = max((second - first).length, 1e-6)
-        return context.window_manager.invoke_props_dialog(self)
+        distance = max((second - first).length, 1e-6)
+        # The dialog belongs to an operator of its own, since this one would go on to receive events.
+        bpy.ops.objectgs.set_distance("INVOKE_DEFAULT", points=self.points, distance=distance)
+        return {"CANCELLED"}
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.lock import lock_holder
 from ...objectgs_addon import scene
@@ -92,7 +93,7 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
     if known_folders.is_remote(location) and not known_folders.is_known(location):
         cls.poll_message_set(f"The capture {location} is on another computer; import it again to use it")
         return False
-    if location.is_dir():
+    if is_folder(location):
         return True
     cls.poll_message_set(f"The capture {location} is missing; put it back, or import it again from where it is now")
     return False
@@ -147,6 +148,14 @@ def work_on_capture(cls: Any, context: bpy.types.Context) -> bool:
 def objects(cls: Any, context: bpy.types.Context) -> bool:
     """Return whether the active reconstruction's folder can be used, and it has a list of objects."""
     return reconstruction(cls, context) and listed_objects(cls, context)
+
+
+def object_mode(cls: Any, context: bpy.types.Context) -> bool:
+    """Return whether Blender is in Object Mode, so that another object may become the active one."""
+    if context.mode == "OBJECT":
+        return True
+    cls.poll_message_set("Switch to Object Mode first")
+    return False
 
 
 def listed_objects(cls: Any, context: bpy.types.Context) -> bool:

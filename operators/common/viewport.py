@@ -8,6 +8,8 @@ from typing import Any
 import bpy
 from bpy.props import EnumProperty
 
+from . import need
+
 
 class InViewport:
     """Base of operators that need a 3D viewport in Object Mode."""
@@ -19,10 +21,7 @@ class InViewport:
         if context.region_data is None:
             cls.poll_message_set("This needs a 3D viewport")
             return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Switch to Object Mode first")
-            return False
-        return True
+        return need.object_mode(cls, context)
 
 
 def selection_mode() -> Any:

@@ -15,8 +15,10 @@ class CleanFloaters(bpy.types.Operator):
     bl_label = "Clean Floaters"
     bl_options = {"REGISTER", "UNDO"}
 
-    everything: BoolProperty(name="All Objects", description="Of all objects of the list, selected or not")
-    restore: BoolProperty(name="Restore", description="Show the floaters again")
+    everything: BoolProperty(
+        name="All Objects", description="Of all objects of the list, selected or not", options={"SKIP_SAVE"}
+    )
+    restore: BoolProperty(name="Restore", description="Show the floaters again", options={"SKIP_SAVE"})
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:

@@ -22,7 +22,7 @@ class SelectByName(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.listed_objects(cls, context)
+        return need.listed_objects(cls, context) and need.object_mode(cls, context)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_props_dialog(self)

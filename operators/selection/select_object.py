@@ -20,7 +20,7 @@ class SelectObject(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.listed_objects(cls, context)
+        return need.listed_objects(cls, context) and need.object_mode(cls, context)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)

@@ -69,7 +69,9 @@ class SeparateSplats(bpy.types.Operator):
     bl_description = "Move the selected splats to a new object"
     bl_options = {"REGISTER", "UNDO"}
 
-    name: StringProperty(name="Name", description="Name of the new object; if empty, that of its source")
+    name: StringProperty(
+        name="Name", description="Name of the new object; if empty, that of its source", options={"SKIP_SAVE"}
+    )
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -32,6 +32,7 @@ class ImportSplats(ImportDialog, bpy.types.Operator):
             "Path of the folder with images/, cameras and masks/ that the splats were trained on. If empty, the "
             "objects of the file are used"
         ),
+        options={"SKIP_SAVE"},
     )
     folder: StringProperty(
         name="Save To",
@@ -39,6 +40,7 @@ class ImportSplats(ImportDialog, bpy.types.Operator):
             "Path of the new reconstruction folder. If empty, it is named after the file, in the folder set in the "
             "preferences"
         ),
+        options={"SKIP_SAVE"},
     )
 
     def draw(self, _context: bpy.types.Context) -> None:

@@ -49,6 +49,7 @@ class _WithDistance:
         description="Distance between splats; 0 for one that suits their size",
         min=0.0,
         subtype="DISTANCE",
+        options={"SKIP_SAVE"},
     )
 
     @classmethod

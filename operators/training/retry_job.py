@@ -5,6 +5,7 @@ import bpy
 from bpy.props import IntProperty
 
 from ...objectgs_addon.blender import messages
+from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 
 
@@ -25,7 +26,7 @@ class RetryJob(bpy.types.Operator):
             self.report({"WARNING"}, "Another job is using this reconstruction; wait for it to finish or stop it")
             return {"CANCELLED"}
         messages.dismiss()
-        return background.submit(job.again(), context.scene, self.report)
+        return background.submit(job.again(locations.backend_python()), context.scene, self.report)
 
 
 CLASSES = (RetryJob,)

@@ -398,6 +398,19 @@ def test_unmoved_objects_keep_exact_transform(root, folder):
     assert (folder / "objects.json").read_bytes() == before
 
 
+def test_objects_scaled_to_nothing_keep_their_place_in_the_folder(root, folder):
+    part(root, "object_parent").location.x += 1.0
+    blender_scene.store_placements(root)
+    stored = (folder / "objects.json").read_bytes()
+    for scale in ((0.0, 0.0, 0.0), (0.0, 1.0, 1.0)):
+        part(root, "object_parent").scale = scale
+        blender_scene.store_placements(root)
+        assert (folder / "objects.json").read_bytes() == stored
+    part(root, "object_parent").scale = (2.0, 2.0, 2.0)
+    blender_scene.store_placements(root)
+    assert abs(np.linalg.det(np.array(entry(root).transform)[:3, :3])) == pytest.approx(8.0, rel=1e-4)
+
+
 @pytest.mark.parametrize(
     "linear",
     [
@@ -559,6 +572,20 @@ def state(root) -> dict:
             for e in read_objects(blender_scene.folder_of(root) / "objects.json")
         },
     }
+
+
+def test_undo_leaves_what_another_program_wrote(root, folder):
+    bpy.ops.ed.undo_push(message="begin")
+    activate(active(), 1)
+    set_sliders(active())
+    bpy.ops.ed.undo_push(message="recolored")
+    moved = np.eye(4)
+    moved[:3, 3] = 1.0, 2.0, 3.0
+    edit_objects(folder / "objects.json", {2: {"removed": True, "transform": moved.tolist()}})
+    bpy.ops.ed.undo()
+    mug, box = read_objects(folder / "objects.json")[:2]
+    assert mug.id == 1 and mug.recolor is None, "what the undo has changed is written"
+    assert box.id == 2 and box.removed and np.array_equal(box.transform, moved)
 
 
 def test_undo_and_redo_restore_all_edits(root, tmp_path):

@@ -16,7 +16,7 @@ from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
-from objectgs.backend.shared.reconstruction.shot import read_shot
+from objectgs.backend.shared.reconstruction.shot import read_shot, write_shot
 from objectgs.objectgs_addon import film
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.scene import kinds
@@ -163,6 +163,18 @@ def test_animation_is_sampled_in_every_frame(root):
             assert_placed(root, shot, frame.samples[0], object_id, splats_of(root, object_id))
     lenses = [frame.samples[0].K[0, 0] for frame in shot.frames]
     assert lenses[0] < lenses[1] < lenses[2]
+
+
+def test_objects_that_grow_from_nothing_are_omitted_until_then(root, tmp_path):
+    pivot = ensure_pivot(root, 1)
+    for frame, size in ((1, 0.0), (3, 1.0)):
+        pivot.scale = [size] * 3
+        pivot.keyframe_insert("scale", frame=frame)
+    bpy.context.scene.frame_set(1)
+    shot = shoot(root, (1, 2, 3))
+    assert [1 in frame.samples[0].objects for frame in shot.frames] == [False, True, True]
+    write_shot(tmp_path / "shot.json", shot)
+    assert len(read_shot(tmp_path / "shot.json").frames) == 3
 
 
 def test_objects_hidden_in_viewport_are_animated(root):

@@ -519,3 +519,15 @@ def test_names_of_options_are_those_of_blender():
     paths = [path for name in ("operators", "objectgs_addon") for path in (root / name).rglob("*.py")]
     code = "".join(path.read_text() for path in paths if path.name != "wording.py")
     assert [name for name in wording._NAMES.values() if f'"{name}"' not in code] == []
+
+
+def test_a_job_again_uses_the_present_python_and_keeps_its_checkpoint(tmp_path):
+    command = backend_command(tmp_path / "old", "train", "capture", "--restart")
+    job = Job("Train", "train", tmp_path, command, tmp_path)
+    assert job.again(None).command == command
+    fresh = job.again(tmp_path / "new").command
+    assert fresh == backend_command(tmp_path / "new", "train", "capture", "--restart"), "nothing was trained yet"
+    job.step = 10
+    assert job.again(None).command == backend_command(tmp_path / "old", "train", "capture")
+    other = Job("Set up", "setup", None, ["python3", "-m", "venv", "--restart"], tmp_path)
+    assert other.again(tmp_path / "new").command == other.command

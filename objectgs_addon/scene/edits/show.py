@@ -8,6 +8,7 @@ therefore stores the values of objects.json and the placement of its parts at th
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import bpy
@@ -15,7 +16,7 @@ import numpy as np
 
 from ....backend.shared.color.recolor import Recolor
 from ....backend.shared.reconstruction.folder import Reconstruction
-from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, read_objects
+from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, is_singular, read_objects
 from .. import carrier
 from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
 from ..object_display import Objects
@@ -82,14 +83,29 @@ def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection
     set_placement(root, collection, None)
 
 
-def store_placements(root: bpy.types.Collection, everything: bool = False) -> None:
+Places = tuple[list | None, list]
+"""An object's placement, None where it was captured, and those of its duplicates, as in objects.json."""
+
+
+def places_of(root: bpy.types.Collection) -> dict[int, Places]:
+    """Return where the objects of a reconstruction are now, by ID."""
+    copies = duplicates_of(root)
+    return {
+        object_id: (_place(root, collection), [_place(root, copy) or _IDENTITY for copy in copies.get(object_id, ())])
+        for object_id, collection in object_collections(root).items()
+        if local_placement(root, collection) is not None
+    }
+
+
+def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | None = None) -> None:
     """Write placements and duplicates that the user changed to objects.json.
 
     Copies made with Blender's own operators are converted to duplicates.
 
     Args:
         root: the reconstruction's collection.
-        everything: also compare objects unchanged since the last sync with the file, as required after an undo.
+        before: after an undo, where objects were before it; those that it has moved are compared with the file, as it
+            has also undone what they remember of the file.
 
     Raises:
         InputError: objects.json cannot be used.
@@ -104,21 +120,22 @@ def store_placements(root: bpy.types.Collection, everything: bool = False) -> No
             remove_duplicate(copy)  # The user deleted its pivot.
     bring_up_to_date(root)
     copies, collections = duplicates_of(root), object_collections(root)
-    now = {
-        object_id: (_place(root, collection), [_place(root, copy) or _IDENTITY for copy in copies.get(object_id, ())])
-        for object_id, collection in collections.items()
-        if local_placement(root, collection) is not None
-    }
-    changed = {
-        object_id
-        for object_id, (place, copied) in now.items()
-        if place != _agreed_place(collections[object_id]) or copied != _agreed_copies(collections[object_id])
-    }
-    if not changed and not everything:
+    now = places_of(root)
+    # What is scaled to nothing, as at the beginning of an animation, keeps its place in the file.
+    now = {object_id: places for object_id, places in now.items() if not _is_flat(places)}
+    if before is None:
+        changed = {
+            object_id
+            for object_id, (place, copied) in now.items()
+            if place != _agreed_place(collections[object_id]) or copied != _agreed_copies(collections[object_id])
+        }
+    else:
+        changed = {object_id for object_id, places in now.items() if places != before.get(object_id)}
+    if not changed:
         return
     entries = {entry.id: entry for entry in read_objects(path)}
     changes: dict[int, dict] = {}
-    for object_id in (now if everything else changed) & entries.keys():
+    for object_id in changed & entries.keys():
         entry, (place, copied) = entries[object_id], now[object_id]
         change = {}
         if not _same([entry.transform], [place]):
@@ -200,6 +217,11 @@ def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list
         return agreed["stored"]
     place = placement_of(root, collection)
     return None if np.array_equal(place, np.eye(4)) else place.tolist()
+
+
+def _is_flat(places: tuple[list | None, list]) -> bool:
+    """Return whether an object or one of its duplicates is scaled to nothing."""
+    return any(is_singular(np.array(place)) for place in (places[0] or _IDENTITY, *places[1]))
 
 
 def _agreed_place(collection: bpy.types.Collection) -> list | None:

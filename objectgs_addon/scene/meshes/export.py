@@ -18,6 +18,9 @@ from ... import scene
 from ...blender.quiet import quiet
 from .shading import lit
 
+_EXPORTERS = {"glb": (bpy.ops.export_scene, "gltf"), "usdc": (bpy.ops.wm, "usd_export")}
+"""File suffix -> the operator that exports it, which is in an add-on or a part of Blender that may be missing."""
+
 
 def export(
     root: bpy.types.Collection, out: Path, suffix: str, ids: list[int] | None, per_object: bool, in_capture: bool
@@ -36,7 +39,7 @@ def export(
         The written files.
 
     Raises:
-        InputError: There is nothing to write, or `out` is a file where a folder is needed.
+        InputError: There is nothing to write, Blender lacks the exporter, or `out` is a file where a folder is needed.
         OSError: A file cannot be written.
         RuntimeError: The exporter failed.
     """
@@ -49,6 +52,11 @@ def export(
     if not chosen:
         raise InputError(
             "No chosen object has a mesh, or all of them are removed; extract meshes, or choose other objects."
+        )
+    if suffix in _EXPORTERS and _EXPORTERS[suffix][1] not in dir(_EXPORTERS[suffix][0]):
+        raise InputError(
+            f"This Blender has no exporter of {suffix.upper()} files; enable its add-on in the preferences, or choose "
+            "another format."
         )
     if per_object and out.is_file():
         raise InputError(f"{out} is a file; choose another name for the folder.")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from ....backend.shared.errors import InputError
 from ..cameras import use_camera, use_size
 from ..kinds import CAMERA, capture_of, kind_of
 
@@ -29,9 +30,19 @@ def prepare_render(scene: bpy.types.Scene) -> None:
 
     Do not call it for a user's own scene without being asked, since it changes the view transform and the Cycles
     bounces.
+
+    Raises:
+        InputError: Blender's color configuration lacks the view transform.
     """
     view = scene.view_settings
-    view.view_transform, view.look, view.exposure, view.gamma = VIEW_TRANSFORM, "None", 0.0, 1.0
+    try:
+        view.view_transform = VIEW_TRANSFORM
+    except TypeError as error:
+        raise InputError(
+            f"The color configuration has no view transform {VIEW_TRANSFORM}, which shows the colors of the photos; "
+            "start Blender without OCIO in its environment, or choose a similar one in Render Properties."
+        ) from error
+    view.look, view.exposure, view.gamma = "None", 0.0, 1.0
     if hasattr(scene, "cycles"):
         scene.cycles.transparent_max_bounces = BOUNCES
         scene.cycles.max_bounces = max(scene.cycles.max_bounces, 4)
