@@ -7,7 +7,6 @@ With a window, a timer calls `JobQueue.poll`; without a window, `blocking.run_bl
 from __future__ import annotations
 
 import itertools
-import os
 import signal
 import sys
 import time
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
+from ...backend.shared.formats.regular_file import resolved
 from .backend_process import BackendProcess
 
 GRACE_SECONDS = 10.0
@@ -370,8 +370,8 @@ class JobQueue:
 
     def of_folder(self, folder: str | Path) -> Job | None:
         """Return the latest job of a reconstruction folder, or None."""
-        wanted = _resolved(folder)
-        return next((job for job in reversed(self.jobs) if job.folder and _resolved(job.folder) == wanted), None)
+        wanted = resolved(folder)
+        return next((job for job in reversed(self.jobs) if job.folder and resolved(job.folder) == wanted), None)
 
     def remove_finished(self) -> None:
         """Remove the jobs that have ended."""
@@ -394,7 +394,3 @@ class JobQueue:
         for job in self.jobs:
             job._changed = True
         self.poll()
-
-
-def _resolved(folder: str | Path) -> str:
-    return os.path.normcase(os.path.realpath(folder))

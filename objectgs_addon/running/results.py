@@ -167,7 +167,7 @@ def _tell_export(job: Job, _owner: bpy.types.Scene | None) -> bool:
     """Tell what was written; return False."""
     count, files, out = (job.result.get(key) for key in ("splats", "files", "exported"))
     if isinstance(count, int) and isinstance(files, int):
-        where = f"{out}" if files == 1 else f"{files} files in {out}"
+        where = str(out) if files == 1 else f"{files} files in {out}"
         messages.show(" ".join([f"Wrote {count:,} splats to {where}.", *map(in_blender, job.warnings)]))
     return False
 

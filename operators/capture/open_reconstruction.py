@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Open a reconstruction folder in the scene, and accept the one that a .blend names."""
 
-import os
 from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
+from ...backend.shared.formats.regular_file import resolved
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.state import folder_trust, object_edits
@@ -42,7 +42,7 @@ class OpenReconstruction(bpy.types.Operator):
             (
                 collection
                 for collection in context.scene.collection.children_recursive
-                if scene.kind_of(collection) == "reconstruction" and _is_same(scene.folder_of(collection), folder)
+                if scene.kind_of(collection) == "reconstruction" and _shows(collection, folder)
             ),
             None,
         )
@@ -55,9 +55,10 @@ class OpenReconstruction(bpy.types.Operator):
         show_folder(self, context, folder, root)
 
 
-def _is_same(first: Path, second: Path) -> bool:
-    """Return whether two paths lead to the same folder, by symbolic links or names of drives."""
-    return os.path.normcase(os.path.realpath(first)) == os.path.normcase(os.path.realpath(second))
+def _shows(root: bpy.types.Collection, folder: Path) -> bool:
+    """Return whether a reconstruction is in a folder; one that is not accepted is compared as text, without a look."""
+    stored = scene.folder_of(root)
+    return stored == folder or (folder_trust.is_accepted(root) and resolved(stored) == resolved(folder))
 
 
 class UseFolder(bpy.types.Operator):

@@ -40,3 +40,8 @@ def is_file(path: Path) -> bool:
 def is_folder(path: Path) -> bool:
     """Return whether a folder exists; False, too, where access is denied."""
     return os.path.isdir(path)  # noqa: PTH112 - Path.is_dir raises then
+
+
+def resolved(folder: str | Path) -> str:
+    """Return a text that is the same for all paths to a folder, by symbolic links or names of drives."""
+    return os.path.normcase(os.path.realpath(folder))

@@ -219,7 +219,7 @@ def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list
     return None if np.array_equal(place, np.eye(4)) else place.tolist()
 
 
-def _is_flat(places: tuple[list | None, list]) -> bool:
+def _is_flat(places: Places) -> bool:
     """Return whether an object or one of its duplicates is scaled to nothing."""
     return any(is_singular(np.array(place)) for place in (places[0] or _IDENTITY, *places[1]))
 
