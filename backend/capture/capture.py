@@ -268,6 +268,8 @@ class Capture:
         Returns:
             (H, W), of the photo's size and the type of `ids`; 0 where the undistorted view does not reach.
         """
+        if self.is_original(index):
+            return ids
         camera, view = self._raw[index][0], self.views[index]
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         # Comparisons with NaN are false.

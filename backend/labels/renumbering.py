@@ -21,7 +21,7 @@ class Renumbered(NamedTuple):
     """Masks with new IDs.
 
     Attributes:
-        masks: the masks (H, W) int64 by the index of their view.
+        masks: the masks (H, W) by the index of their view, as they were if they are kept.
         agreement: how often photos give a point the ID that most of them give it, in the masks as they were.
     """
 
@@ -67,14 +67,15 @@ def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent
 
 def _regions_of(mask: np.ndarray) -> _Regions:
     ids, numbers = np.unique(np.append(mask, 0), return_inverse=True)
-    return _Regions(numbers[:-1].reshape(mask.shape), ids)
+    # All masks are in memory, so their numbers take no more of it than they must.
+    return _Regions(numbers[:-1].reshape(mask.shape).astype(np.min_scalar_type(len(ids))), ids)
 
 
 def _seen(capture: Capture, index: int, regions: _Regions) -> Seen:
     observed = find_observed_points(capture, index)[0]
     points, x, y = find_visible_points(capture, np.ascontiguousarray(capture.points.xyz.T, np.float64), index, observed)
     is_certain = np.isin(points, observed)
-    return Seen(points, np.stack([x, y], 1), regions.numbers[y, x], is_certain, len(regions.ids) - 1)
+    return Seen(points, np.stack([x, y], 1), regions.numbers[y, x].astype(np.int64), is_certain, len(regions.ids) - 1)
 
 
 def _without_id(seen: list[Seen], count: int) -> np.ndarray:

@@ -12,8 +12,8 @@ from skimage.color import rgb2lab
 
 from .random_walker import random_walker
 
-BAND = 3.0
-"""Distance in pixels from a rendered border within which it is placed anew."""
+BAND = 2
+"""Distance in pixels, along rows and columns, from a rendered border within which it is placed anew."""
 
 STEP, PRIOR = 6.0, 0.3
 """CIELAB distance of neighboring pixels that hardly separates them, and weight of what the splats show."""
@@ -36,23 +36,24 @@ def follow_edges(photo: np.ndarray, shown: np.ndarray) -> np.ndarray:
     is_border = ndimage.maximum_filter(labels, 3) != ndimage.minimum_filter(labels, 3)
     if not is_border.any():
         return labels
-    band = ndimage.distance_transform_edt(~is_border) < BAND
+    band = ndimage.maximum_filter(is_border, 2 * BAND + 1)
     nodes = ndimage.binary_dilation(band)
     number = np.full(labels.shape, -1)
     number[nodes] = np.arange(nodes.sum())
-    lab = rgb2lab(photo)
+    lab = rgb2lab(photo[nodes][None])[0]
     height, width = labels.shape
     weights = sparse.csr_array((int(nodes.sum()),) * 2)
     for down, right in _NEIGHBORS:
         here = slice(0, height - down), slice(max(0, -right), width - max(0, right))
         there = slice(down, height), slice(max(0, right), width - max(0, -right))
         both = (number[here] >= 0) & (number[there] >= 0)
-        step = np.linalg.norm(lab[here][both] - lab[there][both], axis=1)
+        ends = number[here][both], number[there][both]
+        step = np.linalg.norm(lab[ends[0]] - lab[ends[1]], axis=1)
         weight = _LEAST + np.exp(-((step / STEP) ** 2)) / np.hypot(down, right)
-        weights += sparse.coo_array((weight, (number[here][both], number[there][both])), shape=weights.shape).tocsr()
+        weights += sparse.coo_array((weight, ends), shape=weights.shape).tocsr()
     seeds = np.where(band[nodes], -1, labels[nodes])
     prior = shown[nodes].astype(np.float64)
     prior /= np.maximum(prior.sum(1, keepdims=True), 1e-6)
-    found = random_walker((weights + weights.T).tocsr(), seeds, prior, PRIOR)
+    found = random_walker((weights + weights.T).tocsr(), seeds, prior, PRIOR, start=prior)
     labels[nodes] = found.argmax(1)
     return labels

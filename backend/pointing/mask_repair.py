@@ -6,11 +6,12 @@ region of a mask whose ID most of its pixels do not get from these votes is wron
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from skimage.measure import label
 
 from .pointer import Pointer
 
@@ -34,7 +35,7 @@ class Repair(NamedTuple):
 
     Attributes:
         ids: (N,) int64, the object of each splat.
-        masks: the mask (H, W) int64 of each training view by its index.
+        masks: the mask (H, W) of each training view by its index, of the smallest unsigned type for all IDs.
     """
 
     ids: np.ndarray
@@ -50,32 +51,44 @@ def repair_masks(
 
     Args:
         pointer: the splats.
-        given: the masks (H, W) of training views by index, with an object at least.
+        given: the masks (H, W) of training views by index, of any type of integers, with an object at least.
         zero_is_known: whether unlabeled pixels are known to show no object; otherwise, they count less, since they may
             be gaps.
-        progress: receives the number of masks that have voted, and of all in all votes.
+        progress: receives the number of finished steps, and the largest number that there may be.
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
-    wrong = {index: np.zeros(mask.shape, bool) for index, mask in given.items()}
-    for number in range(_ROUNDS):
-        voting = {index: np.where(wrong[index], _NO_VOTE, mask) for index, mask in given.items()}
+    type_of_ids = np.min_scalar_type(objects[-1])
+    masks = {index: pointer.reduced(index, mask.astype(type_of_ids)) for index, mask in given.items()}
+    wrong = {index: np.zeros(mask.shape, bool) for index, mask in masks.items()}
+    done = itertools.count(1)
 
-        def tell(done: int, before: int = number * len(given)) -> None:
-            progress(before + done, _ROUNDS * len(given))
+    def tell(*_: object) -> None:
+        progress(min(next(done), (1 + _ROUNDS) * len(masks)), (1 + _ROUNDS) * len(masks))
 
-        votes = pointer.votes(voting, objects, tell)
-        if not zero_is_known:
-            votes[:, 0] *= _GAPS
-        ids = pointer.settle(objects, votes)
-        before = wrong
-        wrong = {index: contradicted(given[index], shown) for index, shown in pointer.shown_ids(ids, list(given))}
-        if all(np.array_equal(before[index], wrong[index]) for index in given):
+    # All masks vote in the first round; in later ones, only what has become wrong or right since.
+    votes = pointer.votes(masks, objects, tell)
+    for number in range(1, _ROUNDS + 1):
+        weighted = votes if zero_is_known else votes * np.where(objects == 0, _GAPS, 1.0)
+        ids = pointer.settle(objects, weighted)
+        before, wrong = wrong, {}
+        for index, shown in pointer.shown_ids(ids, list(masks)):
+            wrong[index] = contradicted(masks[index], shown)
+            tell()
+        changed = [index for index in masks if not np.array_equal(before[index], wrong[index])]
+        if number == _ROUNDS or not changed:
             break
-    masks = {
-        index: np.where(wrong[index], shown, given[index]) if index in given else shown
-        for index, shown in pointer.masks(ids)
-    }
-    return Repair(ids, masks)
+        for sign, then, now in ((-1, before, wrong), (1, wrong, before)):
+            voting = {i: np.where(now[i] & ~then[i], masks[i].astype(np.int64), _NO_VOTE) for i in changed}
+            votes += sign * pointer.votes(voting, objects, tell)
+        # Less than nothing is left by rounding only.
+        np.maximum(votes, 0, out=votes)
+    repaired = {}
+    for index, shown in pointer.masks(ids):
+        mask = shown.astype(type_of_ids)
+        if index in given:
+            mask = np.where(contradicted(given[index], mask), mask, given[index].astype(type_of_ids))
+        repaired[index] = mask
+    return Repair(ids, repaired)
 
 
 def contradicted(mask: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -85,10 +98,7 @@ def contradicted(mask: np.ndarray, shown: np.ndarray) -> np.ndarray:
         mask: (H, W) IDs; a region is connected and has one ID.
         shown: (H, W) IDs.
     """
-    found = np.zeros(mask.shape, bool)
-    for value in np.unique(mask):
-        regions, count = ndimage.label(mask == value)
-        agrees = ndimage.mean(shown == value, regions, np.arange(count + 1))
-        is_large = np.bincount(regions.ravel(), minlength=count + 1) >= _SMALLEST * mask.size
-        found |= ((agrees < _AGREES) & is_large)[regions] & (regions > 0)
-    return found
+    regions = label(mask, background=-1, connectivity=1)
+    sizes = np.bincount(regions.ravel())
+    agree = np.bincount(regions.ravel(), weights=(mask == shown).ravel())
+    return ((agree < _AGREES * sizes) & (sizes >= _SMALLEST * mask.size))[regions]

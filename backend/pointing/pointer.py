@@ -15,7 +15,7 @@ from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
 from .proposals import find_objects, try_regions
-from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions
+from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions, reduction
 from .stroke_masks import Segment, stroke_pixels
 from .strokes import PARTS, Stroke, Strokes, stroke_through
 from .views import Views
@@ -148,7 +148,8 @@ class Pointer:
         """Sum how much each splat contributes to the pixels of each object in masks.
 
         Args:
-            masks: masks (H, W) by the index of the view; pixels of other IDs than those of the objects do not count.
+            masks: masks (h, w) by the index of the view, as from `reduced`; pixels of other IDs than those of the
+                objects do not count.
             objects: (C,) object IDs.
             progress: receives the number of finished masks.
 
@@ -157,26 +158,34 @@ class Pointer:
         """
         found = np.zeros((len(self.splats.means), len(objects)))
         for done, (index, mask) in enumerate(masks.items(), 1):
-            camera = self._views.camera(index)
-            shown = [column for column, object_id in enumerate(objects.tolist()) if (mask == object_id).any()]
-            for columns in (shown[first : first + 3] for first in range(0, len(shown), 3)):
-                planes = np.zeros((3, camera.height, camera.width), np.float32)
-                planes[: len(columns)] = mask == objects[columns, None, None]
-                found[:, columns] += contributions(self.splats, camera, planes, self._primitive)[:, : len(columns)]
+            camera, downscale = self._reduced(index)
+            columns = np.flatnonzero(np.isin(objects, mask))
+            if len(columns):
+                planes = mask == objects[columns, None, None]
+                found[:, columns] += downscale**2 * contributions(self.splats, camera, planes, self._primitive)
             progress(done)
         return found
+
+    def reduced(self, index: int, mask: np.ndarray) -> np.ndarray:
+        """Return the mask (h, w) of a view in the size in which masks vote, from (H, W)."""
+        camera, downscale = self._reduced(index)
+        first = downscale // 2
+        return np.ascontiguousarray(mask[first::downscale, first::downscale][: camera.height, : camera.width])
 
     def settle(self, objects: np.ndarray, votes: np.ndarray) -> np.ndarray:
         """Return the object ID (N,) of each splat by votes (N, C) on the objects (C,), as from `votes`."""
         return self._graph.settle(objects, votes)
 
     def shown_ids(self, ids: np.ndarray, views: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each of the views and the object (H, W) that most of a pixel shows, for the splats' objects (N,)."""
+        """Yield each of the views and the object (h, w) that most of a pixel shows, for the splats' objects (N,).
+
+        The size is that of `reduced`.
+        """
         objects, classes = np.unique(ids, return_inverse=True)
         labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
         for index in views:
             with torch.no_grad():
-                drawn = rasterize(*labeled[:6], self._views.camera(index), primitive=self._primitive)
+                drawn = rasterize(*labeled[:6], self._reduced(index)[0], primitive=self._primitive)
             ranks, parts = (devices.host(plane) for plane in object_ranks(drawn, 1))
             yield index, np.where((ranks[0] >= 0) & (parts[0] > 0.5), objects[np.maximum(ranks[0], 0)], 0)
 
@@ -196,6 +205,12 @@ class Pointer:
                 shown[..., 0] += 1.0 - shown.sum(2)
             yield index, objects[follow_edges(self._picture(index), shown)]
 
+    def _reduced(self, index: int) -> tuple[Camera, int]:
+        """Return the camera of a view, reduced by a factor if its image is large, and the factor."""
+        camera = self._views.camera(index)
+        downscale = reduction(camera)
+        return camera.reduced(downscale), downscale
+
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""
         if self._segment is None:
@@ -210,7 +225,7 @@ class Pointer:
         pixels, is_mask = stroke_pixels(
             stroke, drawn.others, (camera.width, camera.height), self._segment, lambda: self._seen(stroke, camera)
         )
-        found = contributions(self.splats, camera, np.stack([pixels] * 3), self._primitive)[:, 0]
+        found = contributions(self.splats, camera, pixels[None], self._primitive)[:, 0]
         if not found.sum() > 0.5:
             raise StrokeOnNothing(number, stroke.view if isinstance(stroke.view, str) else "the viewport")
         return _Shown(found, float(pixels.mean()) if is_mask else None)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -50,6 +50,12 @@ VOTES = 0.3
 SEEDED = 0.8
 """The splats that make up this part of what a stroke shows are its seeds; the rest shines through from behind."""
 
+LONGEST = 1000
+"""Longer side in pixels of the images in which contributions to whole photos are summed."""
+
+_MOST_PHOTOS = 150
+"""Largest number of photos in which splats are counted; of more, some at equal distances are used."""
+
 _PHOTOS, _SAMPLES, _VISIBLE = 16, 5, 0.3
 
 
@@ -84,18 +90,28 @@ def contributions(splats: Generated, camera: Camera, planes: np.ndarray, primiti
     Args:
         splats: N splats of the model.
         camera: the view.
-        planes: (3, H, W) float32, three weights of the pixels.
+        planes: (C, H, W), weights of the pixels.
         primitive: "3d" or "2d".
 
     Returns:
-        (N, 3) float64: for each plane, the sum of weight times blending weight over the pixels.
+        (N, C) float64: for each plane, the sum of weight times blending weight over the pixels.
     """
     # The gradient of a pixel's color with respect to that of a splat is the splat's blending weight there.
     sh = torch.zeros((len(splats.means), 1, 3), device=splats.means.device, requires_grad=True)
-    drawn = rasterize(*splats[:4], sh, splats.ids, camera, primitive=primitive)
-    drawn.color.backward(devices.upload(np.ascontiguousarray(planes, np.float32), sh))
-    assert sh.grad is not None
-    return devices.host(sh.grad[:, 0]).astype(np.float64) / C0
+    drawn = rasterize(*splats[:4], sh, splats.ids, replace(camera, gain=(1.0, 1.0, 1.0)), primitive=primitive)
+    found = np.empty((len(splats.means), len(planes)))
+    for first in range(0, len(planes), 3):
+        some = planes[first : first + 3]
+        channels = np.zeros((3, camera.height, camera.width), np.float32)
+        channels[: len(some)] = some
+        (gradient,) = torch.autograd.grad(drawn.color, sh, devices.upload(channels, sh), retain_graph=True)
+        found[:, first : first + 3] = devices.host(gradient[:, 0, : len(some)]) / C0
+    return found
+
+
+def reduction(camera: Camera) -> int:
+    """Return the factor by which an image is reduced before contributions to all of it are summed."""
+    return -(-max(camera.width, camera.height) // LONGEST)
 
 
 @dataclass(frozen=True)
@@ -283,16 +299,20 @@ def build_graph(
     means = devices.host(splats.means).astype(np.float64)
     seen, facing = np.zeros(len(means)), np.zeros((len(means), 3))
     in_photos = {}
-    chosen = set(np.unique(np.linspace(0, len(cameras) - 1, _PHOTOS).round().astype(int)).tolist())
-    for number, camera in enumerate(cameras):
-        ones = np.ones((3, camera.height, camera.width), np.float32)
-        weight = contributions(splats, camera, ones, primitive)[:, 0]
+    counted = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MOST_PHOTOS)).round().astype(int))
+    chosen = set(counted[np.unique(np.linspace(0, len(counted) - 1, _PHOTOS).round().astype(int))].tolist())
+    for done, number in enumerate(counted.tolist(), 1):
+        camera = cameras[number]
+        downscale = reduction(camera)
+        small = camera.reduced(downscale)
+        ones = np.ones((1, small.height, small.width), np.float32)
+        weight = downscale**2 * contributions(splats, small, ones, primitive)[:, 0]
         to_camera = camera.center - means
         facing += weight[:, None] * to_camera / np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
         seen += weight
         if number in chosen:
             in_photos[number] = weight.astype(np.float32)
-        progress(number + 1, len(cameras))
+        progress(done, len(counted))
     nodes = np.flatnonzero(seen > SEEN)
     if len(nodes) <= weights.neighbors:
         nodes = np.arange(len(means))

@@ -72,6 +72,12 @@ class Camera:
         whole = (left - x, top - y, right - x, bottom - y)
         return replace(self, K=K, width=width, height=height, whole=whole)
 
+    def reduced(self, downscale: int) -> Camera:
+        """Return a camera whose pixels are blocks of downscale x downscale of these; a remainder is left out."""
+        K = np.array(self.K, np.float64)
+        K[:2] /= downscale
+        return replace(self, K=K, width=self.width // downscale, height=self.height // downscale)
+
     def at_origin(self) -> Camera:
         """Return a copy of the camera at the origin of the world."""
         viewmat = self.viewmat.copy()

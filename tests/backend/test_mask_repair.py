@@ -62,7 +62,10 @@ def mask_of(capture, index):
     return np.zeros((72, 96), np.int64) if mask is None else mask
 
 
-def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command) -> None:
+@pytest.mark.parametrize("longest", [1000, 50])
+def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command, monkeypatch, longest) -> None:
+    """Larger images vote in a reduced size."""
+    monkeypatch.setattr("backend.pointing.splat_graph.LONGEST", longest)
     scene, out = trained
     before = rendered(scene, out)
     given = load_capture(scene.folder, tmp_path / "given")

@@ -54,7 +54,11 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
     capture = opened.capture if trained is None else _with_masks(trained, options, reporter)
     if capture is None:
         raise InputError(f"{opened.folder.folder} has no capture with masks; import the splats again with --capture.")
-    given = {index: mask for index in capture.train_indices if (mask := capture.uncorrected_mask(index)) is not None}
+    given = {
+        index: mask.astype(np.min_scalar_type(mask.max()))
+        for index in capture.train_indices
+        if (mask := capture.uncorrected_mask(index)) is not None
+    }
     if not any(mask.any() for mask in given.values()):
         raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
     reporter.expect({
