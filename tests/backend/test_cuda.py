@@ -18,10 +18,10 @@ HERE = Path("tests") / "backend"
     "words",
     [
         [HERE / "simulated_cuda.py", HERE / "test_raster.py", HERE / "test_raster_properties.py"],
-        pytest.param([HERE / "test_raster_stiff.py", "-k", "not (2d or disc or gradcheck)"], marks=pytest.mark.long),
-        pytest.param([HERE / "test_raster_stiff.py", "-k", "(2d or disc) and not gradcheck"], marks=pytest.mark.long),
+        pytest.param([HERE / "test_raster_stiff.py", "-k", "near_plane or needle or overflow"], marks=pytest.mark.long),
+        pytest.param([HERE / "test_raster_stiff.py", "-k", "not gradcheck"], marks=pytest.mark.slow),
     ],
-    ids=["random scenes", "stiff scenes", "stiff scenes of discs"],
+    ids=["random scenes", "some stiff scenes", "stiff scenes"],
 )
 def test_kernels_in_simulator(words):
     done = subprocess.run(

@@ -498,7 +498,7 @@ def test_unusable_scene_is_reported_in_a_sentence(tmp_path, capsys):
     assert "Sequence_1 does not exist" in capsys.readouterr().err
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_scene_is_trained_and_measured(lerf, tmp_path, capfd):
     words = ["lerf-mask", str(lerf.folder), "--out", str(tmp_path / "all"), "--steps", "60"]
     assert reproduce.main(words) == EXIT_DONE

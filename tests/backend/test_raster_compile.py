@@ -78,7 +78,7 @@ def test_second_process_uses_cached_kernels():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="the user's cache folder is determined differently")
-@pytest.mark.long
+@pytest.mark.slow
 def test_read_only_installation_uses_user_cache(tmp_path):
     """If the installation cannot be written to, the cache is in the user's cache folder."""
     copy_backend(tmp_path)
@@ -101,7 +101,7 @@ print(sum(depth_order.stats.cache_hits.values()))
     assert list((tmp_path / "home").rglob("*.nbi"))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_change_of_any_package_file_invalidates_cache(tmp_path):
     """A constant of one file is compiled into kernels of other files."""
     copy_backend(tmp_path)
@@ -149,7 +149,7 @@ def test_variants_are_saved_where_files_cannot_be_locked(tmp_path, monkeypatch):
     assert file.load(1) == "code"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_model_kernels_depend_only_on_lower_layers(tmp_path):
     copy_backend(tmp_path)
     script = """

@@ -44,5 +44,5 @@ def test_interrupted_commands_lose_nothing(templates, runner, tmp_path):
 
 
 def test_competing_processes_take_turns(templates, tmp_path):
-    assert race_for_lock(40, tmp_path / "lock")[0] == 0
+    assert race_for_lock(20, tmp_path / "lock")[0] == 0
     assert edit_at_once(4, tmp_path, templates)[1] == []
