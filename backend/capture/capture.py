@@ -270,14 +270,20 @@ class Capture:
         """
         if self.is_original(index):
             return ids
+        # Views of one camera are undistorted alike.
+        at = self._cache.get(("undistorted", self._raw[index][0].id), lambda: self._pixels_of_photo(index))
+        return np.where(at >= 0, ids.ravel()[at], ids.dtype.type(0))
+
+    def _pixels_of_photo(self, index: int) -> np.ndarray:
+        """Return for each pixel of a view's photo the pixel of the view, counted by rows: (H, W) int32, -1: none."""
         camera, view = self._raw[index][0], self.views[index]
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         # Comparisons with NaN are false.
         at = self._undistorted(index, np.stack([x.ravel(), y.ravel()], 1))
         inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
-        found = np.zeros(len(at), ids.dtype)
-        column, row = at[inside].astype(np.int64).T
-        found[inside] = ids[row, column]
+        found = np.full(len(at), -1, np.int32)
+        column, row = at[inside].astype(np.int32).T
+        found[inside] = row * view.width + column
         return found.reshape(camera.height, camera.width)
 
     def _undistorted(self, index: int, pixels: np.ndarray) -> np.ndarray:

@@ -622,7 +622,8 @@ def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path
     capture = load_capture(scene.folder, tmp_path / "cache")
     before = capture.mask(0)
     photo = capture.photo_mask(0, before)
-    assert photo.shape == (72, 96)
+    assert photo.shape == (72, 96) and photo.dtype == before.dtype
+    assert np.array_equal(capture.photo_mask(1, before), photo), "of the same camera"
     Image.fromarray(photo.astype(np.uint8)).save(scene.folder / "masks" / "view_000.png")
     after = load_capture(scene.folder, tmp_path / "other").mask(0)
     assert (before > 0).sum() > 200 and np.mean(before != after) < 0.03
