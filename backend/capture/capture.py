@@ -245,12 +245,6 @@ class Capture:
         ids = self._cache.get(("mask", index, downscale), lambda: self._read_mask(index, downscale))
         return self.without_left_out(ids.astype(np.int64))
 
-    def K(self, index: int, downscale: int = 1) -> np.ndarray:  # noqa: N802 - as in the equations
-        """Return the intrinsics of `image(index, downscale)`: (3, 3) float64."""
-        K = self.views[index].K.copy()
-        K[:2] /= downscale
-        return K
-
     def keypoints(self, index: int) -> Keypoints:
         """Return COLMAP's observations in a view, except those whose undistortion does not converge."""
         image = self._raw[index][1]

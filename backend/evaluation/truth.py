@@ -185,6 +185,6 @@ def _read_view(capture: Capture, index: int) -> _View:
         raise InputError(f"{depth_file} and {ids_file} differ in size; make the capture again.")
     # The truth has the size of the images on disk; the capture's views may be smaller.
     across, down = depth.shape[1] / view.width, depth.shape[0] / view.height
-    K = capture.K(index)
+    K = view.K
     intrinsics = np.array([K[0, 0] * across, K[1, 1] * down, K[0, 2] * across, K[1, 2] * down])
     return _View(view.viewmat, intrinsics, depth, ids)

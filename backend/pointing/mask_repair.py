@@ -58,7 +58,7 @@ def repair_masks(
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
     type_of_ids = np.min_scalar_type(objects[-1])
-    masks = {index: pointer.reduced(index, mask.astype(type_of_ids)) for index, mask in given.items()}
+    masks = {index: pointer.voting_mask(index, mask.astype(type_of_ids)) for index, mask in given.items()}
     wrong = {index: np.zeros(mask.shape, bool) for index, mask in masks.items()}
     done = itertools.count(1)
 

@@ -15,7 +15,7 @@ from ..shared.errors import InputError
 from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
 from .proposals import find_objects, try_regions
-from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions, reduction
+from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions, reduced
 from .stroke_masks import Segment, stroke_pixels
 from .strokes import PARTS, Stroke, Strokes, stroke_through
 from .views import Views
@@ -148,7 +148,7 @@ class Pointer:
         """Sum how much each splat contributes to the pixels of each object in masks.
 
         Args:
-            masks: masks (h, w) by the index of the view, as from `reduced`; pixels of other IDs than those of the
+            masks: masks (h, w) by the index of the view, as from `voting_mask`; pixels of other IDs than those of the
                 objects do not count.
             objects: (C,) object IDs.
             progress: receives the number of finished masks.
@@ -158,7 +158,7 @@ class Pointer:
         """
         found = np.zeros((len(self.splats.means), len(objects)))
         for done, (index, mask) in enumerate(masks.items(), 1):
-            camera, downscale = self._reduced(index)
+            camera, downscale = reduced(self._views.camera(index))
             columns = np.flatnonzero(np.isin(objects, mask))
             if len(columns):
                 planes = mask == objects[columns, None, None]
@@ -166,9 +166,9 @@ class Pointer:
             progress(done)
         return found
 
-    def reduced(self, index: int, mask: np.ndarray) -> np.ndarray:
+    def voting_mask(self, index: int, mask: np.ndarray) -> np.ndarray:
         """Return the mask (h, w) of a view in the size in which masks vote, from (H, W)."""
-        camera, downscale = self._reduced(index)
+        camera, downscale = reduced(self._views.camera(index))
         first = downscale // 2
         return np.ascontiguousarray(mask[first::downscale, first::downscale][: camera.height, : camera.width])
 
@@ -179,13 +179,13 @@ class Pointer:
     def shown_ids(self, ids: np.ndarray, views: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each of the views and the object (h, w) that most of a pixel shows, for the splats' objects (N,).
 
-        The size is that of `reduced`.
+        The size is that of `voting_mask`.
         """
         objects, classes = np.unique(ids, return_inverse=True)
         labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
         for index in views:
             with torch.no_grad():
-                drawn = rasterize(*labeled[:6], self._reduced(index)[0], primitive=self._primitive)
+                drawn = rasterize(*labeled[:6], reduced(self._views.camera(index))[0], primitive=self._primitive)
             ranks, parts = (devices.host(plane) for plane in object_ranks(drawn, 1))
             yield index, np.where((ranks[0] >= 0) & (parts[0] > 0.5), objects[np.maximum(ranks[0], 0)], 0)
 
@@ -204,12 +204,6 @@ class Pointer:
             if objects[0] == 0:
                 shown[..., 0] += 1.0 - shown.sum(2)
             yield index, objects[follow_edges(self._picture(index), shown)]
-
-    def _reduced(self, index: int) -> tuple[Camera, int]:
-        """Return the camera of a view, reduced by a factor if its image is large, and the factor."""
-        camera = self._views.camera(index)
-        downscale = reduction(camera)
-        return camera.reduced(downscale), downscale
 
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""

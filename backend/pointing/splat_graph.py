@@ -109,9 +109,10 @@ def contributions(splats: Generated, camera: Camera, planes: np.ndarray, primiti
     return found
 
 
-def reduction(camera: Camera) -> int:
-    """Return the factor by which an image is reduced before contributions to all of it are summed."""
-    return -(-max(camera.width, camera.height) // LONGEST)
+def reduced(camera: Camera) -> tuple[Camera, int]:
+    """Return the camera of an image in which contributions to all of it are summed, and by what it is reduced."""
+    downscale = -(-max(camera.width, camera.height) // LONGEST)
+    return camera.reduced(downscale), downscale
 
 
 @dataclass(frozen=True)
@@ -303,8 +304,7 @@ def build_graph(
     chosen = set(counted[np.unique(np.linspace(0, len(counted) - 1, _PHOTOS).round().astype(int))].tolist())
     for done, number in enumerate(counted.tolist(), 1):
         camera = cameras[number]
-        downscale = reduction(camera)
-        small = camera.reduced(downscale)
+        small, downscale = reduced(camera)
         ones = np.ones((1, small.height, small.width), np.float32)
         weight = downscale**2 * contributions(splats, small, ones, primitive)[:, 0]
         to_camera = camera.center - means

@@ -76,7 +76,9 @@ class Camera:
         """Return a camera whose pixels are blocks of downscale x downscale of these; a remainder is left out."""
         K = np.array(self.K, np.float64)
         K[:2] /= downscale
-        return replace(self, K=K, width=self.width // downscale, height=self.height // downscale)
+        left, top, right, bottom = (bound / downscale for bound in self.bounds)
+        whole = None if self.whole is None else (left, top, right, bottom)
+        return replace(self, K=K, width=self.width // downscale, height=self.height // downscale, whole=whole)
 
     def at_origin(self) -> Camera:
         """Return a copy of the camera at the origin of the world."""

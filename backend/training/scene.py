@@ -71,15 +71,16 @@ class Scene:
         self._lock = threading.Lock()
 
     def camera(self, index: int, downscale: int = 1) -> Camera:
-        """Return a view's camera in scene units."""
+        """Return the camera of `capture.image(index, downscale)` in scene units."""
         view = self.capture.views[index]
-        return Camera(
+        camera = Camera(
             self.normalization.viewmat(view.viewmat),
-            self.capture.K(index, downscale),
-            view.width // downscale,
-            view.height // downscale,
+            view.K,
+            view.width,
+            view.height,
             gain=(float(self.gains[index, 0]), float(self.gains[index, 1]), float(self.gains[index, 2])),
         )
+        return camera.reduced(downscale)
 
     def before_surroundings(self, positions: torch.Tensor) -> torch.Tensor:
         """Return which of the positions (n, 3) in scene units are nearer than surroundings without points, bool."""

@@ -176,3 +176,15 @@ def test_crop_matches_full_image(primitive):
     for cut in (part, whole.crop(x, 1, width + 5, height + 3).crop(1, y - 1, width, height)):
         got = rasterize(**scene, camera=cut, primitive=primitive).color
         np.testing.assert_allclose(got, want[:, y : y + height, x + 1 : x + 1 + width], rtol=1e-4, atol=2e-5)
+
+
+def test_reduced_camera_sees_the_same_directions():
+    whole = camera(64, 48)
+    small, part = whole.reduced(3), whole.crop(6, 9, 31, 30)
+    assert (small.width, small.height) == (21, 16)
+    point = np.array([0.3, -0.2, 2.0])
+    (column, row, depth), (x, y, _) = whole.K @ point, small.K @ point
+    assert (column / depth, row / depth) == pytest.approx((3 * x / depth, 3 * y / depth))
+    one, other = part.reduced(3), small.crop(2, 3, 10, 10)
+    assert np.allclose(one.K, other.K) and (one.width, one.height) == (10, 10)
+    assert one.bounds == pytest.approx((-2, -3, 64 / 3 - 2, 13))
