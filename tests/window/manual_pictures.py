@@ -27,7 +27,7 @@ BLURRED = (11, 30)
 """Photos of the demo, by number, that are blurred for the picture of weak poses."""
 AWAY = (300, 862)
 """A mouse position without effect on the image."""
-PREFERENCES = (260, 200, 980, 585)
+PREFERENCES = (260, 200, 980, 512)
 """Where the window of the preferences, which opens over the other one, shows those of the extension."""
 
 
@@ -147,6 +147,8 @@ def setting_up(window: Window, python: str) -> None:
     blender = window.blender
     preferences = f'bpy.context.preferences.addons["{harness.PACKAGE}"].preferences'
     blender.run(f"{preferences}.backend_python = ''")
+    folder = blender.run(f"result = {preferences}.reconstructions")
+    blender.run(f"{preferences}.reconstructions = ''")
     window.panels()
     window.sidebar("first-panel", 265)
     blender.run(f"""
@@ -158,6 +160,7 @@ def setting_up(window: Window, python: str) -> None:
         with bpy.context.temp_override(window=bpy.context.window_manager.windows[1]):
             bpy.ops.wm.window_close()
         {preferences}.backend_python = {python!r}
+        {preferences}.reconstructions = {folder!r}
     """)
 
 
