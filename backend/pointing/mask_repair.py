@@ -54,16 +54,16 @@ def repair_masks(
         given: the masks (H, W) of training views by index, of any type of integers, with an object at least.
         zero_is_known: whether unlabeled pixels are known to show no object; otherwise, they count less, since they may
             be gaps.
-        progress: receives the number of finished steps, and the largest number that there may be.
+        progress: receives the number of finished steps, and that of all rounds, the later of which may be left out.
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
     type_of_ids = np.min_scalar_type(objects[-1])
     masks = {index: pointer.voting_mask(index, mask.astype(type_of_ids)) for index, mask in given.items()}
     wrong = {index: np.zeros(mask.shape, bool) for index, mask in masks.items()}
-    done = itertools.count(1)
+    done, steps = itertools.count(1), (1 + _ROUNDS) * len(masks)
 
     def tell(*_: object) -> None:
-        progress(min(next(done), (1 + _ROUNDS) * len(masks)), (1 + _ROUNDS) * len(masks))
+        progress(min(next(done), steps), steps)
 
     # All masks vote in the first round; in later ones, only what has become wrong or right since.
     votes = pointer.votes(masks, objects, tell)
