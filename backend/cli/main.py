@@ -31,6 +31,7 @@ from .parser import UsageError, build_parser
 
 _OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG)
 _LONGEST = 1000
+_UNALLOCATED = ("allocate memory", "DefaultCPUAllocator: not enough memory")
 """Number of characters of an error message; names and paths in it may be longer."""
 
 
@@ -144,8 +145,9 @@ def _describe_error(error: Exception) -> str | None:
             "The GPU's memory is full; close programs that use it, or try a smaller --max-size or --max-anchors, or "
             "--device cpu. The same command resumes from the last checkpoint."
         )
-    # torch reports a lack of memory with a RuntimeError.
-    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "allocate memory" in str(error)):
+    # torch reports a lack of memory with a RuntimeError, with other words on Windows.
+    unallocated = isinstance(error, RuntimeError) and any(words in str(error) for words in _UNALLOCATED)
+    if isinstance(error, MemoryError) or unallocated:
         return "There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors."
     if isinstance(error, ModuleNotFoundError):
         return describe_missing_package(error)

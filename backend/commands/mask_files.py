@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..capture.files import encode_mask
-from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX
+from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file
 from ..shared.reconstruction.folder import STROKES
 
 RECORD, REPAIRED = "masks.json", "repair.json"
@@ -35,18 +35,26 @@ def new_masks(capture: Path, kept: Path | None = None) -> Iterator[Path]:
         capture: the capture's folder.
         kept: where masks/ is moved to that was there before; None: it is deleted.
     """
-    folder, part = capture / "masks", capture / f"{PART_PREFIX}masks{PART_SUFFIX}"
-    shutil.rmtree(part, ignore_errors=True)
+    folder = capture / "masks"
+    part, old = (capture / f"{PART_PREFIX}{name}{PART_SUFFIX}" for name in ("masks", "masks-old"))
+    if old.exists() and not folder.exists():
+        old.rename(folder)  # An earlier run was killed in between.
+    for left in (part, old):
+        shutil.rmtree(left, ignore_errors=True)
     part.mkdir()
     try:
         yield part
-        if kept is not None:
-            folder.rename(kept)
-        elif folder.exists():
-            shutil.rmtree(folder)
-        part.rename(folder)
+        if folder.exists():
+            replace_file(folder, kept or old)
+        try:
+            replace_file(part, folder)
+        except OSError:
+            if (kept or old).exists():
+                (kept or old).rename(folder)
+            raise
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        for left in (part, old):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def write_mask(folder: Path, name: str, mask: np.ndarray) -> None:

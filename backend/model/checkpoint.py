@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ..shared.errors import InputError
-from ..shared.formats.atomic import atomic_file, make_folder
+from ..shared.formats.atomic import atomic_file, make_folder, replace_file
 from ..shared.formats.json_file import parse_json
 from ..shared.formats.regular_file import require_regular
 from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
@@ -52,7 +52,7 @@ def save_checkpoint(
             file.flush()
             if keep_current and (folder / CURRENT).exists():
                 os.fsync(file.fileno())
-                (folder / CURRENT).replace(folder / PREVIOUS)
+                replace_file(folder / CURRENT, folder / PREVIOUS)
     except OSError as error:
         raise InputError(
             f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); free some space and run "

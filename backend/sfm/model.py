@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from ..shared.errors import InputError
+from ..shared.formats.atomic import replace_file
 from . import database
 from .agreement import Agreement, measure_agreement
 
@@ -165,8 +166,8 @@ def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
     part.mkdir()
     model.write(part)
     if target.exists():
-        target.rename(old)
-    part.rename(target)
+        replace_file(target, old)
+    replace_file(part, target)
     shutil.rmtree(old, ignore_errors=True)
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -84,9 +85,17 @@ def _wait_while_paused(process: subprocess.Popen, reporter: StoppingReporter) ->
         if reporter.stop():
             raise Cancelled(_STOPPED)
         return
-    child = psutil.Process(process.pid)
-    child.suspend()
+    paused = []
+    with suppress(psutil.NoSuchProcess):
+        child = psutil.Process(process.pid)
+        # On Windows, the python.exe of an environment starts the real one.
+        for each in (child, *child.children(recursive=True)):
+            with suppress(psutil.NoSuchProcess):
+                each.suspend()
+                paused.append(each)
     try:
         reporter.stop()  # Returns when the pause ends.
     finally:
-        child.resume()
+        for each in paused:
+            with suppress(psutil.NoSuchProcess):
+                each.resume()

@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
+from ..shared.stopping import take_stdin
 from .database import camera_of, listed_names, read_pairs, restore_names
 from .rig import tie_rigs
 
@@ -337,17 +338,17 @@ STAGES: dict[str, Callable[..., None]] = {
 }
 
 
-def _end_with_parent() -> None:
-    """End this process when the one that began it is gone, so that the next one does not find the database in use."""
+def _end_with(parent: int) -> None:
+    """End this process when the one at the other end of a pipe is gone, so that the next one can use the database."""
     # Without Python's buffer, whose lock would be held when the process ends by itself.
-    while os.read(0, 1):
+    while os.read(parent, 1):
         pass
     os._exit(1)
 
 
 def main(name: str, *arguments: str) -> None:
     """Run a stage."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_end_with, args=(take_stdin(),), daemon=True).start()
     pycolmap.logging.minloglevel = _ERRORS
     STAGES[name](*arguments)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
@@ -68,7 +69,7 @@ class StopRequest:
             self._stopped = True
 
         if read_stdin and sys.stdin is not None:
-            threading.Thread(target=self._read, daemon=True).start()
+            threading.Thread(target=self._read, args=(_own_stdin(),), daemon=True).start()
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -79,10 +80,10 @@ class StopRequest:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def _read(self) -> None:
+    def _read(self, lines: Iterable[str]) -> None:
         attached = False
         try:
-            for line in sys.stdin:
+            for line in lines:
                 word = line.strip()
                 if word == "stop":
                     self._stopped = True
@@ -96,6 +97,23 @@ class StopRequest:
             pass  # Standard input is closed or unreadable.
         if attached:
             self._stopped = True
+
+
+def take_stdin() -> int:
+    """Return a descriptor of standard input, which from now on is empty for this process and those that it starts.
+
+    While a thread waits for input, Windows lets everything else wait that only asks what kind of file the same pipe is,
+    as programs and some libraries do at their start.
+    """
+    taken, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.close(nothing)
+    return taken
+
+
+def _own_stdin() -> Iterable[str]:
+    """Return the lines of standard input, by `take_stdin` unless it was replaced."""
+    return open(take_stdin(), encoding="utf-8", errors="replace") if sys.stdin is sys.__stdin__ else sys.stdin
 
 
 class StoppingReporter(Reporter):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -217,7 +218,8 @@ def find_backend(python: str | None) -> None:
     """
     wanted = python or os.environ.get("OBJECTGS_PYTHON")
     if wanted:
-        found = shutil.which(Path(wanted).expanduser())
+        path = str(Path(wanted).expanduser())
+        found = shutil.which(path) or (shutil.which(path + ".exe") if sys.platform == "win32" else None)
         if found is None:
             raise InputError(f"There is no Python at {wanted}; check --backend-python or OBJECTGS_PYTHON.")
         os.environ["OBJECTGS_PYTHON"] = str(absolute(Path(found)))

@@ -301,7 +301,7 @@ class Job:
 
     def _crash(self, code: int) -> str:
         """Describe an unexpected end in one sentence, with the last message of the program."""
-        if self.if_silent is not None and not self._answered and code >= 0:
+        if self.if_silent is not None and not self._answered and not _is_crash(code):
             return self.if_silent
         text = _last_message(self.log)
         how = "ended without a result" if code == EXIT_DONE else _how_it_ended(code)
@@ -321,6 +321,11 @@ def _number(value: Any) -> float | int | None:
     return value if is_number and abs(value) <= _LARGEST_NUMBER else None
 
 
+def _is_crash(code: int) -> bool:
+    """Return whether an exit code is that of a signal, or of an exception on Windows."""
+    return code < 0 or (sys.platform == "win32" and code >= 0xC0000000)
+
+
 def _how_it_ended(code: int) -> str:
     """Describe an exit code: signals by name on POSIX, exceptions by number on Windows."""
     if code < 0:
@@ -330,14 +335,17 @@ def _how_it_ended(code: int) -> str:
             return f"crashed ({signal.strsignal(-code) or signal.Signals(-code).name})"
         except ValueError:
             return f"crashed (signal {-code})"
-    if sys.platform == "win32" and code >= 0xC0000000:
+    if _is_crash(code):
         return f"crashed (Windows error 0x{code:08X})"
     return f"ended unexpectedly (exit code {code})"
 
 
+_FATAL = ("Fatal Python error", "Windows fatal exception")
+
+
 def _last_message(log: list[str]) -> str:
     """Return the most informative line about a crash: the interpreter's fatal error, or else the last line."""
-    named = [line for line in log if line.startswith("Fatal Python error")]
+    named = [line for line in log if line.startswith(_FATAL)]
     return (named or log or [""])[-1].strip()
 
 
@@ -369,9 +377,10 @@ class JobQueue:
         return changed
 
     def of_folder(self, folder: str | Path) -> Job | None:
-        """Return the latest job of a reconstruction folder, or None."""
+        """Return the job of a reconstruction folder that runs, or else the latest one; None without any."""
         wanted = resolved(folder)
-        return next((job for job in reversed(self.jobs) if job.folder and resolved(job.folder) == wanted), None)
+        jobs = [job for job in reversed(self.jobs) if job.folder and resolved(job.folder) == wanted]
+        return next((job for job in jobs if job is self.running), jobs[0] if jobs else None)
 
     def remove_finished(self) -> None:
         """Remove the jobs that have ended."""

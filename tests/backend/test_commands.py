@@ -857,7 +857,14 @@ def test_unexpected_error_returns_exit_code_1(write_capture, run_command, monkey
     assert result.messages("error") == ["Unexpected error: ZeroDivisionError: two lines"]
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes."),
+    ],
+)
 def test_out_of_memory_is_reported(write_capture, run_command, monkeypatch, error):
     def greedy(*_):
         raise error

@@ -264,3 +264,23 @@ def test_deleted_capture_ends_training_with_checkpoint(drive, endless, masks):
     shutil.move(capture / "gone", capture / ("masks" if masks else "images"))
     assert arguments.main([*map(str, train[:6]), "--steps", str(step + 2)]) == EXIT_DONE
     assert progress_of(out)["step"] == step + 2
+
+
+def test_children_have_no_input():
+    """Lines on standard input reach the command alone; on Windows, children that look at it would hang."""
+    program = (
+        "import subprocess, sys, time\n"
+        "from backend.shared.stopping import StopRequest\n"
+        "stop = StopRequest()\n"
+        "with stop.listening(read_stdin=True):\n"
+        "    print(subprocess.run([sys.executable, '-c', 'input()'], stderr=-3).returncode, flush=True)\n"
+        "    while not stop():\n"
+        "        time.sleep(0.01)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "1\n", "it has read nothing"
+        process.stdin.write("stop\n")
+        process.stdin.flush()
+        assert process.wait(timeout=30) == 0

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from objectgs.objectgs_addon.environment import environment
-from objectgs.objectgs_addon.environment.worker import checks, choice, events, layout, pip, setup
+from objectgs.objectgs_addon.environment.worker import checks, choice, events, layout, pip, programs, setup
 from objectgs.objectgs_addon.process import backend_process
 from objectgs.objectgs_addon.process.jobs import JobQueue, State
 
@@ -256,6 +256,23 @@ def test_system_without_locked_packages_is_rejected(root, monkeypatch):
     with pytest.raises(events.Refused, match="choose the device CPU"):
         choice.check_system(root / "requirements", "cuda")
     choice.check_system(root / "requirements", "cpu")
+
+
+def test_macos_without_wheels_is_rejected(root, monkeypatch):
+    monkeypatch.setattr(choice.platform, "mac_ver", lambda: ("13.6.1", ("", "", ""), "arm64"))
+    with pytest.raises(events.Refused, match="need macOS 14 or newer, and this is 13"):
+        choice.check_system(root / "requirements", "cpu")
+    monkeypatch.setattr(choice.platform, "mac_ver", lambda: ("14.0", ("", "", ""), "arm64"))
+    choice.check_system(root / "requirements", "cpu")
+
+
+def test_children_of_a_guarded_program_have_no_input():
+    """The program's own input says that its parent lives; on Windows, children that look at it would hang."""
+    read = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'input()'], stderr=subprocess.STDOUT)"
+    lines = []
+    command = programs.guarded(Path(sys.executable), "timeit", "-n1", "-r1", read)
+    assert programs.run(command, lambda: False, lines.append) == 0
+    assert any("EOFError" in line for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -431,6 +431,18 @@ def test_job_of_folder_is_found_by_equivalent_paths(make, tmp_path):
     queue.add(make("", folder=None))
     assert queue.of_folder(tmp_path / "a" / ".") is newer
     assert queue.of_folder(tmp_path / "b") is None
+    older.state = State.PAUSED
+    assert queue.of_folder(tmp_path / "a") is older, "a waiting job does not hide the one that runs"
+    older.state = State.WAITING
+
+
+@pytest.mark.parametrize(("code", "text"), [(0xC0000005, "0xC0000005"), (1, "choose another")])
+def test_crashes_on_windows_are_told_from_programs_that_are_no_backend(monkeypatch, code, text):
+    monkeypatch.setattr(jobs.sys, "platform", "win32")
+    job = Job(title="", kind="train", folder=None, command=[], cwd=Path(), if_silent="No backend; choose another.")
+    job.log = ["Windows fatal exception: access violation", '  File "x.py"']
+    found = job._crash(code)
+    assert text in found and (code == 1 or "access violation" in found)
 
 
 class Recorder(Reporter):

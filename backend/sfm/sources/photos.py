@@ -27,6 +27,7 @@ IMAGES, MASKS = "images", "masks"
 FRAMES, _FILES = "frames.json", "photos.json"
 """Files in sfm/ with the frames that were taken of each video, and with the size and time of each photo's file."""
 _OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
+_READS_ALL_NAMES = os.name != "nt"
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
 
@@ -92,7 +93,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         count = "only one photo" if files else "no photos"
         raise InputError(f"{base} contains {count}; poses need at least two photos of the same scene.")
     if not in_place:
-        _require_space(files, capture)
+        copies = ((path, capture / IMAGES / _readable(path.relative_to(base))) for path in files)
+        _require_space([path for path, copy in copies if not _is_copied(copy)], capture)
     # Masks fit the pixels as they are stored.
     turn = not in_place and not (source / MASKS).is_dir() and not masked
     photos, unreadable = [], {}
@@ -107,13 +109,16 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             camera = photo_files.camera_of(path, turn)
             if in_place and not photo_files.is_read_by_colmap(path):
                 raise InputError(f"{path.name} would have to be converted; choose another folder as --out.")
+            copy = _readable(relative)
+            if copy != relative and (in_place or not turn):
+                raise InputError(f"{path.name} is a name that COLMAP cannot read on Windows; use plain letters.")
             status = path.stat()
             files_now[name] = [status.st_size, status.st_mtime_ns, turn]
             is_changed = name in known and known[name] != files_now[name]
             if is_changed:
                 database.remove_all(capture / WORK)
             if not in_place:
-                copied = photo_files.copy_photo(path, capture / IMAGES / relative, turn, again=is_changed)
+                copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
             photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
             names[name] = relative.as_posix()
@@ -126,6 +131,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         folder = "" if is_alone else _stem_in(base, path)
         if stems[folder.casefold()] > 1:
             folder = path.relative_to(base).as_posix()
+        folder = _readable(Path(folder)).as_posix() if folder else ""
         try:
             taken = _frames_of(path, capture, folder, frames, reporter)
             photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}", folder) for name in taken]
@@ -150,6 +156,14 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
 def _stem_in(base: Path, path: Path) -> str:
     """Return the path of a file from a folder on, without its suffix."""
     return path.relative_to(base).with_suffix("").as_posix()
+
+
+def _readable(relative: Path) -> Path:
+    """Return the path of a copy in images/ that COLMAP can open: on Windows, it reads names in plain letters only."""
+    if _READS_ALL_NAMES or str(relative).isascii():
+        return relative
+    letters = (c if c.isascii() else f"u{ord(c):x}" for c in relative.as_posix())
+    return Path("".join(letters))
 
 
 def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
@@ -215,6 +229,10 @@ def _listed(base: Path, capture: Path) -> list[Path]:
         return suffix not in photo_files.COPIED and path.with_suffix("") in (photos if suffix in VIDEOS else copied)
 
     return sorted((path for path in paths if not is_double(path)), key=lambda path: natural_order(path.as_posix()))
+
+
+def _is_copied(copy: Path) -> bool:
+    return any(copy.with_suffix(suffix).exists() for suffix in (copy.suffix, ".jpg", ".png"))
 
 
 def _require_space(paths: Sequence[Path], capture: Path) -> None:

@@ -18,6 +18,9 @@ _LONGEST = 100
 
 _ABANDONED_SECONDS = 24 * 3600
 
+_PATIENCE = 2.0 if os.name == "nt" else 0.0
+"""Seconds to wait for other processes that have a file open."""
+
 _records: list[Created] = []
 
 
@@ -91,6 +94,23 @@ def remove_abandoned(folder: Path) -> None:
                 path.unlink()
 
 
+def replace_file(part: Path, path: Path) -> None:
+    """Rename a file or folder; a file at `path` is replaced.
+
+    On Windows, this waits for a moment while another process reads what is renamed or replaced, such as Blender or a
+    virus scanner.
+    """
+    until = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            part.replace(path)
+            return
+        except PermissionError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(_PATIENCE / 40)
+
+
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield the path of an empty temporary file in the folder of `path`, which replaces `path` at the end.
@@ -106,7 +126,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         with part.open("rb+") as file:
             os.fsync(file.fileno())
         is_new = not os.path.lexists(path)
-        part.replace(path)
+        replace_file(part, path)
     except BaseException as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)

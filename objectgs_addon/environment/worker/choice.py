@@ -11,6 +11,8 @@ from . import layout
 from .events import Refused, emit
 from .pip import Pip
 
+MACOS = 14
+"""Oldest macOS that all packages have wheels for."""
 WHEELS = "https://download.pytorch.org/whl/"
 _BUILDS = {"cpu": "cpu", "cuda": "cu130"}
 """Names of PyTorch's builds for the devices, and of the indexes that have them."""
@@ -47,6 +49,9 @@ def check_system(requirements: Path, device: str) -> None:
             f"The backend's packages are not available for {computer}, only for {', '.join(names)}; choose a Python "
             "for one of these, or a Python that already has the packages."
         )
+    version = platform.mac_ver()[0]
+    if version and int(version.partition(".")[0]) < MACOS:
+        raise Refused(f"The backend's packages need macOS {MACOS} or newer, and this is {version}; update macOS.")
     if device == "cuda" and not (folder / f"{system}-cuda.txt").is_file():
         raise Refused(f"There are no packages for NVIDIA GPUs for {computer}; choose the device CPU.")
 

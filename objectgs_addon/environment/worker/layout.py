@@ -116,7 +116,8 @@ def short_path(folder: Path) -> Iterator[Path]:
         yield folder
         return
     link = Path(tempfile.mkdtemp(prefix="ogs")) / "e"
-    made = subprocess.run(["cmd", "/c", "mklink", "/J", str(link), str(folder)], capture_output=True, check=False)
+    command = ["cmd", "/c", "mklink", "/J", str(link), str(folder)]
+    made = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
     try:
         yield folder if made.returncode else link
     finally:

@@ -15,11 +15,15 @@ from typing import Any
 
 from .events import Stopped
 
-# The program ends when its input ends, which means that its parent has ended.
+# The program ends when its input ends, which means that its parent has ended. Programs that it starts have no input: on
+# Windows they would wait at their start until that which is being read here ends.
 _GUARDED = """\
 import os, runpy, sys, threading
+parent, nothing = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+os.dup2(nothing, 0)
+os.close(nothing)
 def watch():
-    while os.read(0, 1024):
+    while os.read(parent, 1024):
         pass
     os._exit(1)
 threading.Thread(target=watch, daemon=True).start()
@@ -87,10 +91,21 @@ def run(
             on_tick()
     finally:
         if child.poll() is None:
-            child.kill() if os.name == "nt" else os.killpg(child.pid, signal.SIGKILL)
+            _kill(child)
             child.wait()
         with contextlib.suppress(OSError):
             child.stdin.close()
+
+
+def _kill(child: subprocess.Popen[bytes]) -> None:
+    """End a program and its children, which on Windows include the Python that an environment's python.exe starts."""
+    if os.name != "nt":
+        os.killpg(child.pid, signal.SIGKILL)
+        return
+    tree = ["taskkill", "/F", "/T", "/PID", str(child.pid)]
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        subprocess.run(tree, stdin=subprocess.DEVNULL, capture_output=True, timeout=5, check=False)
+    child.kill()
 
 
 def _read_lines(stream: Any, lines: queue.Queue[str | None]) -> None:

@@ -25,6 +25,7 @@ from .programs import guarded, run
 MEGABYTES = {"cpu": 180, "cuda": 3000}
 """Size of the downloads in MB, for the progress; on most systems that of cpu includes torch."""
 
+_LOCKED_BYTE = 1 << 30
 _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
 
 
@@ -131,6 +132,8 @@ def _lock(file: IO[str]) -> bool:
         if sys.platform == "win32":
             import msvcrt
 
+            # The byte at the file's position is locked, so everyone has to go to the same; it is beyond the content.
+            os.lseek(file.fileno(), _LOCKED_BYTE, os.SEEK_SET)
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl

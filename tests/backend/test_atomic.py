@@ -1,0 +1,53 @@
+"""Files and folders that take the place of others as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from backend.commands import mask_files
+from backend.shared.formats import atomic
+
+
+def test_replacing_waits_for_programs_that_read_the_file(tmp_path, monkeypatch):
+    """On Windows, a file that another process has open cannot be replaced."""
+    refused, replace = [], Path.replace
+
+    def busy(self, target):
+        if len(refused) < 3:
+            refused.append(target)
+            raise PermissionError(13, "in use")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", busy)
+    monkeypatch.setattr(atomic, "_PATIENCE", 0.4)
+    atomic.write_atomic(tmp_path / "a", b"new")
+    assert (tmp_path / "a").read_bytes() == b"new" and len(refused) == 3
+    refused.clear()
+    monkeypatch.setattr(atomic, "_PATIENCE", 0.0)
+    with pytest.raises(PermissionError):
+        atomic.write_atomic(tmp_path / "a", b"newer")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"] and (tmp_path / "a").read_bytes() == b"new"
+
+
+def test_masks_are_kept_if_others_cannot_take_their_place(tmp_path, monkeypatch):
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks" / "a.png").write_bytes(b"old")
+
+    def refuse(part, path):
+        if path.name == "masks":
+            raise PermissionError(13, "in use")
+        part.replace(path)
+
+    monkeypatch.setattr(mask_files, "replace_file", refuse)
+    for kept in (None, tmp_path / "kept"):
+        with pytest.raises(PermissionError), mask_files.new_masks(tmp_path, kept) as folder:
+            (folder / "a.png").write_bytes(b"new")
+        assert [path.name for path in tmp_path.iterdir()] == ["masks"]
+        assert (tmp_path / "masks" / "a.png").read_bytes() == b"old"
+    monkeypatch.undo()
+    with mask_files.new_masks(tmp_path) as folder:
+        (folder / "a.png").write_bytes(b"new")
+    assert [path.name for path in tmp_path.iterdir()] == ["masks"]
+    assert (tmp_path / "masks" / "a.png").read_bytes() == b"new"
