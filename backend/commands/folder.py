@@ -211,7 +211,8 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
 
 def outdate_results(folder: Reconstruction) -> None:
     """Mark meshes as those of an earlier model, and remove its evaluation: another one takes its place."""
-    outdate_meshes(folder.meshes)
+    listed = read_objects(folder.objects) if folder.objects.exists() else []
+    outdate_meshes(folder.meshes, {entry.id for entry in listed})
     folder.evaluation.unlink(missing_ok=True)
 
 

@@ -6,16 +6,21 @@ They are properties of the reconstruction's collection, so that undo removes a s
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import bpy
 import numpy as np
 
 from ...backend.shared.color.palette import colors_of
+from ...backend.shared.errors import InputError
+from ...backend.shared.formats.json_file import read_json
+from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.splats.picking import View
 from .. import scene
 
@@ -60,6 +65,19 @@ def content(root: bpy.types.Collection) -> dict[str, Any]:
 def count(root: bpy.types.Collection, object_id: int) -> int:
     """Return the number of strokes on an object."""
     return sum(stroke["object"] == object_id for stroke in strokes_of(root))
+
+
+def names_without_strokes(root: bpy.types.Collection) -> list[str]:
+    """Return the names of the listed objects that no stroke marks, so that the next separation makes them background.
+
+    Objects of single splats are none of these: a separation leaves them as they are.
+    """
+    marked = {NOTHING, *(stroke["object"] for stroke in strokes_of(root))}
+    return [
+        item.name
+        for item in root.objectgs.objects
+        if not item.separated and scene.from_stored(item.object_id) not in marked
+    ]
 
 
 def active_object(root: bpy.types.Collection) -> Any:
@@ -116,6 +134,24 @@ def set_proposed(root: bpy.types.Collection, proposed: dict[str, Any]) -> None:
     _store(root, [{**stroke, "object": ids[stroke["object"]]} for stroke in strokes])
 
 
+def restore(root: bpy.types.Collection, folder: Path) -> None:
+    """Add the strokes of the latest separation in a folder to a reconstruction that has none; skip invalid files."""
+    path = Reconstruction(folder).strokes
+    if root.objectgs.strokes or not path.is_file():
+        return
+    with contextlib.suppress(InputError, KeyError, TypeError, ValueError, AttributeError):
+        kept = read_json(path)
+        strokes = [
+            {**{key: each[key] for key in ("part", "area") if key in each}, **_place_of(each),
+             "object": int(each["object"]), "points": each["points"]}
+            for each in kept["strokes"]
+        ]  # fmt: skip
+        for object_id in sorted({stroke["object"] for stroke in strokes} - {NOTHING}):
+            _add_row(root, object_id).name = str(kept["objects"].get(str(object_id)) or f"Object {object_id}")
+        root.objectgs.everything = bool(kept["everything"])
+        _store(root, strokes)
+
+
 def _place_of(stroke: dict[str, Any]) -> dict[str, Any]:
     """Return the entry of a stroke that says where it was drawn: in a photo, or through a camera."""
     return {"view": str(stroke["view"])} if "view" in stroke else {"camera": dict(stroke["camera"])}
@@ -140,9 +176,10 @@ def _part_of(stroke: dict[str, Any]) -> int:
 
 
 def remove_object(root: bpy.types.Collection, index: int) -> None:
-    """Remove an object of the list with its strokes."""
+    """Remove an object of the list with its strokes; what it was belongs to no object from then on."""
     properties = root.objectgs
     object_id = properties.marked[index].object_id
+    _allow_nothing(root)
     properties.marked.remove(index)
     properties.active_marked = max(0, min(properties.active_marked, len(properties.marked) - 1))
     _store(root, [stroke for stroke in strokes_of(root) if stroke["object"] != object_id])
@@ -176,8 +213,14 @@ def remove_stroke(root: bpy.types.Collection, number: int) -> None:
 
 def clear(root: bpy.types.Collection) -> None:
     """Remove all strokes and objects."""
+    _allow_nothing(root)
     root.objectgs.marked.clear()
     _store(root, [])
+
+
+def _allow_nothing(root: bpy.types.Collection) -> None:
+    if root.objectgs.everything:
+        root.objectgs.everything = False
 
 
 def _store(root: bpy.types.Collection, strokes: list[dict[str, Any]]) -> None:

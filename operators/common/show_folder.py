@@ -11,6 +11,7 @@ from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon import scene
 from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import known_folders
+from ...objectgs_addon.picking import marks
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_edits
 from ...objectgs_addon.state import viewports as view
@@ -29,6 +30,7 @@ def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder
     object_edits.fill(root)
     context.scene.objectgs.active = root
     if is_new:
+        marks.restore(root, folder)
         view.show(root)
     try:
         if Reconstruction(folder).splats.exists():

@@ -16,6 +16,9 @@ from ...objectgs_addon.running import background, pointing
 from ..common import need
 from ..common.reporting import reports_errors
 
+_LISTED = 3
+"""Largest number of objects that are named in a question."""
+
 
 class _OfMarks:
     """Base of operators on the list of marked objects."""
@@ -112,6 +115,20 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.markable(cls, context) and need.splats(cls, context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        names = marks.names_without_strokes(need.active_root(context))
+        if not names:
+            return self.execute(context)
+        listed = ", ".join([*names[:_LISTED], *(["..."] if len(names) > _LISTED else [])])
+        return context.window_manager.invoke_confirm(
+            self,
+            event,
+            title=f"{len(names)} Object{'s' if len(names) > 1 else ''} Without Strokes",
+            message=f"Only marked objects are kept; these become background: {listed}",
+            confirm_text="Separate Marked Objects",
+            icon="WARNING",
+        )
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:

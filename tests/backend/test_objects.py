@@ -8,9 +8,11 @@ import pytest
 
 from backend.shared.color.recolor import Recolor
 from backend.shared.errors import InputError
+from backend.shared.reconstruction.meshes import MeshEntry, outdate_meshes, read_meshes, write_meshes
 from backend.shared.reconstruction.objects import (
     SceneObject,
     edit_objects,
+    forget_vanished,
     members_of,
     merged,
     read_objects,
@@ -48,6 +50,15 @@ def test_edits_are_applied_and_survive_new_votes(path):
     assert read_objects(path) == [SceneObject(2**32 - 1, "box", (40, 50, 60), 7)]
     write_objects(path, [MUG])
     assert read_objects(path) == [edited], "edits are kept while their object is missing"
+
+
+def test_edits_of_vanished_objects_are_forgotten(path):
+    edit_objects(path, {1: {"name": "cup"}, 9: {"separated": True, "name": "part", "color": [1, 2, 3]}})
+    write_objects(path, [BOX])
+    forget_vanished(path)
+    write_objects(path, [BOX, MUG])
+    assert [(entry.id, entry.name) for entry in read_objects(path)] == [(1, "mug"), (9, "part"), (2**32 - 1, "box")]
+    forget_vanished(path.with_name("missing.json"))
 
 
 def test_edits_can_be_reverted(path):
@@ -154,3 +165,19 @@ def test_invalid_files_are_reported_in_one_sentence(tmp_path, text):
 def test_missing_file_is_reported(tmp_path):
     with pytest.raises(InputError, match=r"objects\.json does not exist"):
         read_objects(tmp_path / "objects.json")
+
+
+def test_meshes_of_vanished_objects_are_deleted(tmp_path):
+    entries = {
+        "1": MeshEntry("1", "mug", (1, 2), 100, file="1.ply", texture="1.png"),
+        "3": MeshEntry("3", "box", (3,), 100, file="3.ply", texture="3.png"),
+        "0": MeshEntry("0", "rest", (0,), 100, file="0.ply"),
+        "scene": MeshEntry("scene", "all", None, 100, file="scene.ply"),
+    }
+    for name in ("1.ply", "1.png", "3.ply", "3.png", "0.ply", "scene.ply"):
+        (tmp_path / name).write_bytes(b"")
+    write_meshes(tmp_path, entries, 100)
+    outdate_meshes(tmp_path, {1, 4})
+    kept = read_meshes(tmp_path)
+    assert set(kept) == {"1", "0", "scene"} and all(entry.trained_steps is None for entry in kept.values())
+    assert {path.name for path in tmp_path.iterdir()} == {"1.ply", "1.png", "0.ply", "scene.ply", "meshes.json"}

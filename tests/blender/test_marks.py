@@ -140,6 +140,42 @@ def test_strokes_are_kept_in_the_file(root, tmp_path):
     assert marks.content(bpy.context.scene.objectgs.active) == before
 
 
+def test_strokes_of_a_separation_are_shown_again_in_another_file(root, monkeypatch):
+    monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
+    folder = str(blender_scene.folder_of(root))
+    item = marks.add_object(root)
+    item.name = "can"
+    marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1), (9, 1), (9, 9)], area=True)
+    marks.add_stroke(root, marks.NOTHING, views(root)[0], [(5, 5)], area=False)
+    before = marks.content(root)
+    bpy.ops.objectgs.separate_marked()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.objectgs.open_reconstruction(directory=folder)
+    again = bpy.context.scene.objectgs.active
+    assert marks.content(again) == before
+    (Path(folder) / "strokes.json").write_text('{"strokes": [{}], "everything": 1, "objects": 3}')
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.objectgs.open_reconstruction(directory=folder)
+    assert not bpy.context.scene.objectgs.active.objectgs.marked
+
+
+def test_objects_without_strokes_are_named_before_they_are_lost(root, monkeypatch):
+    rows = [(item.object_id, item.name) for item in root.objectgs.objects]
+    assert len(rows) > 2 and marks.names_without_strokes(root) == [name for _, name in rows]
+    marks.add_stroke(root, blender_scene.from_stored(rows[0][0]), views(root)[0], [(1, 1)], area=False)
+    root.objectgs.objects[1].separated = True
+    assert marks.names_without_strokes(root) == [name for _, name in rows[2:]]
+
+
+def test_what_is_removed_belongs_to_no_object(root):
+    for remove in (lambda: marks.remove_object(root, 0), lambda: marks.clear(root)):
+        item = marks.add_object(root)
+        marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1)], area=False)
+        root.objectgs.everything = True
+        remove()
+        assert not marks.content(root)["everything"]
+
+
 def test_labels_color_visible_splats(root):
     """Labels are numbers of colors; hidden splats have none, and clearing them restores the splats' own colors."""
     parts = [part for part in root.all_objects if blender_scene.kind_of(part) == "splats"]

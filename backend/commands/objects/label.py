@@ -20,7 +20,7 @@ from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.lock import locked
-from ...shared.reconstruction.objects import default_name
+from ...shared.reconstruction.objects import default_name, forget_vanished
 from ...shared.reconstruction.plan import write_plan
 from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
@@ -70,6 +70,7 @@ def _label_trained(
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
     with locked(trained.folder.folder):
+        forget_vanished(trained.folder.objects)
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(trained.folder, "label"):
             pointer = opened.pointer(reporter.progress, segment)
@@ -91,6 +92,7 @@ def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace,
     segment = segmentation(options, opened.device)
     ensure_kernels(reporter, opened.device)
     with locked(opened.folder.folder):
+        forget_vanished(opened.folder.objects)
         reporter.begin(GRAPH, "Comparing the splats with their neighbors")
         with stage(opened.folder, "label"):
             ids = opened.pointer(reporter.progress, segment).solve(strokes)

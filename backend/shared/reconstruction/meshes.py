@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -96,15 +96,28 @@ def write_meshes(folder: Path, entries: Mapping[str, MeshEntry], trained_steps: 
     write_json(folder / NAME, plain({"trained_steps": trained_steps, "meshes": meshes}))
 
 
-def outdate_meshes(folder: Path) -> None:
-    """Mark the meshes in `folder` as those of an earlier model, whose number of steps the present one may have, too."""
+def outdate_meshes(folder: Path, objects: Container[int]) -> None:
+    """Mark meshes as those of an earlier model, whose number of steps the present one may have, too.
+
+    Args:
+        folder: The `meshes` folder of a reconstruction.
+        objects: IDs of its present objects; the meshes of others are deleted.
+    """
     try:
         entries = read_meshes(folder)
     except InputError:
         return  # It is created anew.
-    if entries:
-        outdated = {key: replace(entry, trained_steps=None) for key, entry in entries.items()}
-        write_meshes(folder, outdated, None)
+    if not entries:
+        return
+    kept = {
+        key: replace(entry, trained_steps=None)
+        for key, entry in entries.items()
+        if entry.ids is None or any(i == 0 or i in objects for i in entry.ids)
+    }
+    write_meshes(folder, kept, None)
+    for entry in (entries[key] for key in entries.keys() - kept.keys()):
+        for name in filter(None, (entry.file, entry.texture)):
+            (folder / name).unlink(missing_ok=True)
 
 
 def _entry(key: str, values: dict[str, Any]) -> MeshEntry:

@@ -107,6 +107,17 @@ def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
         write_json(path, {"objects": list(objects), "edits": edits})
 
 
+def forget_vanished(path: Path) -> None:
+    """Remove the edits of IDs that no object has, so that another object that gets such an ID is not edited."""
+    if not path.exists():
+        return
+    with _locked(path):
+        content = read_json(path)
+        edits = _edits(content, path)
+        listed = {str(entry.id) for entry in read_objects(path)}
+        write_json(path, {**content, "edits": {key: edit for key, edit in edits.items() if key in listed}})
+
+
 Changes = Mapping[int, Mapping[str, Any]]
 """Object ID -> new values of fields in `EDITABLE`; None reverts an edit."""
 
