@@ -8,10 +8,10 @@ Captures are the demo (`make demo`), and the real tabletop of ../shared/data if 
 masks. In each of the photos, one stroke then marks each object that shows there: along the row through the middle of
 the object's largest inscribed circle, without a fifth at both ends. If the masks leave pixels unlabeled, one such
 stroke in one photo marks them, too. `label` separates the objects, and the IDs of its renders are compared with the
-true masks of the held-out views. Before, `propose` finds objects without any stroke. --write saves the figures of two
-seeds to docs/figures/pointing.json and the table to docs/pointing.md; with --proposals, only `propose` is measured, and
-with --meshes, meshes of the demo's objects from strokes and from the true masks are compared with its true ones. The
-document then keeps its other figures.
+true masks of the held-out views. Before, the objects are marked one after the other, and `propose` finds objects
+without any stroke. --write saves the figures of two seeds to docs/figures/pointing.json and the table to
+docs/pointing.md; with --proposals, only `propose` is measured, and with --meshes, meshes of the demo's objects from
+strokes and from the true masks are compared with its true ones. The document then keeps its other figures.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from backend.capture import Capture, load_capture
+from backend.commands.objects.pointable import Pointable, open_pointable
 from backend.evaluation.metrics import IdScores, psnr
 from backend.model.draw import draw
+from backend.pointing import strokes as strokes_file
 from backend.pointing.strokes import stroke_through
+from backend.shared.events import Reporter
 from backend.training.scene import Scene
 from backend.training.state import load_model
 from benchmarks import documents, shared
@@ -45,6 +49,9 @@ CAPTURES = {
 }
 GOOD = 0.8
 """IoU from which on a proposed object counts as found."""
+
+IN_TURN = (1, 2, 3, 5, 1000)
+"""Numbers of marked objects that the document shows; the last one stands for all."""
 
 SMALLEST = 30
 """Number of pixels below which an object is not marked in a photo."""
@@ -68,6 +75,42 @@ def strokes_of(truth: Capture, photos: int) -> dict[str, Any]:
     if mask is not None and not everything:
         strokes.append({"object": 0, "view": truth.views[chosen[0]].name, "points": stroke_through(mask == 0)})
     return {"strokes": strokes, "everything": everything}
+
+
+def open_splats(folder: Path) -> Pointable:
+    """Open the splats of a reconstruction as the add-on does for strokes."""
+    return open_pointable(argparse.Namespace(folder=folder, capture=None, device="cpu", memory_mb=2000.0), Reporter())
+
+
+def in_turn(folder: Path, truth: Capture, seed: int) -> dict[str, float]:
+    """Mark the objects of a training one after the other, in random order, each by one stroke in the same photo.
+
+    Returns:
+        By the number of objects that are marked so far, the mean IoU of these over what splats show in training photos.
+        What is not marked yet belongs to none of them.
+    """
+    opened = open_splats(folder)
+    pointer = opened.pointer(lambda _done, _total: None)
+    numbers = {name: index for index, name in enumerate(opened.views.names)}
+    masks = {numbers[truth.views[index].name]: truth.mask(index) for index in truth.train_indices}
+    objects = np.array([0, *truth.object_ids.tolist()])
+    voting = {index: pointer.voting_mask(index, mask) for index, mask in masks.items() if mask is not None}
+    shown = pointer.votes(voting, objects, lambda _done: None)
+    drawn = strokes_file.strokes_of(json.loads(json.dumps(strokes_of(truth, 1))), "the truth", opened.views.names)
+    order = np.random.default_rng(seed).permutation(sorted({stroke.object for stroke in drawn.strokes} - {0})).tolist()
+    found = {}
+    for count in range(1, len(order) + 1):
+        marked = order[:count]
+        some = tuple(stroke for stroke in drawn.strokes if stroke.object in marked)
+        ids = pointer.solve(replace(drawn, strokes=some, everything=False))
+        found[str(count)] = float(np.mean([_iou(shown, objects, ids, object_id) for object_id in marked]))
+    return found
+
+
+def _iou(shown: np.ndarray, objects: np.ndarray, ids: np.ndarray, object_id: int) -> float:
+    """Return the IoU of an object by the pixels (N, C) of each object that splats show, and the splats' IDs (N,)."""
+    true, is_found = shown[:, objects == object_id][:, 0], ids == object_id
+    return float(true[is_found].sum() / (shown[is_found].sum() + true[~is_found].sum()))
 
 
 def copy_without_masks(folder: Path, copy: Path) -> None:
@@ -128,6 +171,7 @@ def measured(folder: Path, photos: Sequence[int], minutes: float, seed: int) -> 
         copy_without_masks(folder, capture)
         shared.run_backend("train", capture, "--out", unlabeled, "--minutes", minutes, "--seed", seed)
         rows["0"] = {"psnr": scores(unlabeled / "checkpoint", truth)["psnr"]}
+        rows["in turn"] = in_turn(unlabeled, truth, seed)
         file, out = scratch / "proposed.json", scratch / "proposed"
         shutil.copytree(unlabeled, out)
         seconds = shared.run_backend("propose", out, "--strokes", file)
@@ -173,6 +217,24 @@ def measured_meshes(folder: Path, photos: Sequence[int], minutes: float, seed: i
     return rows
 
 
+def _table_in_turn(captures: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Return the lines on objects that are marked one after the other."""
+    rows = []
+    for name, seeds in captures.items():
+        turns = [seed["in turn"] for seed in seeds if "in turn" in seed]
+        if turns:
+            counts = [min(count, len(turns[0])) for count in IN_TURN]
+            rows.append((name, *(shared.spread([turn[str(count)] for turn in turns], "{:.3f}") for count in counts)))
+    head = ("capture", *(f"{count} marked" for count in IN_TURN[:-1]), "all")
+    return [
+        "A user marks one object after the other, so that most of the scene belongs to none at first: mean IoU of "
+        "those that are marked so far, in random order, over what the splats show in training photos, before the "
+        "borders are trained.",
+        "",
+        *shared.table(head, rows),
+    ]
+
+
 def document(found: Mapping[str, Any]) -> str:
     """Return the text of docs/pointing.md."""
     lines = [
@@ -188,7 +250,7 @@ def document(found: Mapping[str, Any]) -> str:
     ]
     rows = []
     for name, seeds in found["captures"].items():
-        for count in sorted(set(seeds[0]) - {"0", "proposed"}):
+        for count in sorted(set(seeds[0]) - {"0", "in turn", "proposed"}):
             cells = [
                 shared.spread([seed[count][key] for seed in seeds], form)
                 for key, form in (("miou", "{:.3f}"), ("miou_all", "{:.3f}"))
@@ -212,6 +274,8 @@ def document(found: Mapping[str, Any]) -> str:
     ]
     head = ("capture", "photos with strokes", "mIoU", "with unlabeled", "PSNR before, dB", "after, dB", "seconds")
     lines += shared.table(head, rows)
+    if any("in turn" in seeds[0] for seeds in found["captures"].values()):
+        lines += ["", "## One after the other", "", *_table_in_turn(found["captures"])]
     if proposals:
         lines += [
             "",

@@ -23,12 +23,10 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from backend.capture import load_capture
-from backend.commands.objects.pointable import open_pointable
 from backend.model.generate import Generated
 from backend.pointing import strokes as strokes_file
-from backend.shared.events import Reporter
 from benchmarks import shared
-from benchmarks.pointing import strokes_of
+from benchmarks.pointing import open_splats, strokes_of
 
 UPDATES = 5
 
@@ -55,8 +53,7 @@ def main() -> None:
     parser.add_argument("--copies", type=int, nargs="+", default=[1, 7])
     options = parser.parse_args()
     shared.compile_everything()
-    common = argparse.Namespace(folder=options.folder, capture=None, device="cpu", memory_mb=2000.0)
-    opened = open_pointable(common, Reporter())
+    opened = open_splats(options.folder)
     assert opened.capture is not None
     truth = load_capture(opened.capture.folder, opened.folder.cache)
     drawn = json.loads(json.dumps(strokes_of(truth, 2)))

@@ -37,8 +37,9 @@ LEAST = 1e-4
 """Least weight of an edge."""
 
 STROKES, FOUND, CERTAIN = 1e-4, 2e-3, 0.5
-"""Weights of the colors of the strokes, and of what was found with these, for each marked object: the more objects are
-marked, the more their colors tell. The last number is the probability from which on a node counts as found."""
+"""Weights of the colors of the strokes for each marked object, and of what was found with these, relative to the square
+root of their number: the more objects are marked, the more their colors tell. The last number is the probability from
+which on a node counts as found."""
 
 NOTHING = 1e-4
 """Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
@@ -214,9 +215,13 @@ class SplatGraph:
         else:
             rough = rough_walker(self.weights, labels, prior, self.clusters, self.coarse)
         found = rough.argmax(1)
-        # As in GrabCut, what was found tells more about an object's colors than strokes do.
-        known = np.where((rough.max(1) > CERTAIN) & ~self._loose(found, labels, everything), found, -1)
-        prior = FOUND * marked * self.colors.likeness(known, len(objects)) + outside
+        # As in GrabCut, what was found tells more about an object's colors than strokes do. What rather belongs to none
+        # counts even if that is uncertain: its colors would else be taken for those of the objects.
+        is_known = rough.max(1) > CERTAIN
+        if not everything:
+            is_known |= found == 0
+        known = np.where(is_known & ~self._loose(found, labels, everything), found, -1)
+        prior = FOUND * marked**0.5 * self.colors.likeness(known, len(objects)) + outside
         probabilities = self._walk(labels, prior, 1.0, rough if before is None else before.among(objects))
         found = self._joined(probabilities.argmax(1), labels, everything)
         ids = objects[found][self.nearest]
