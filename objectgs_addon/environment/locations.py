@@ -100,6 +100,12 @@ def backend_sentence() -> str:
     return f"The backend's Python {chosen} does not exist; choose another, or clear the field."
 
 
+def is_chosen_missing() -> bool:
+    """Return whether the user has chosen a Python for the backend that does not exist."""
+    chosen = _chosen_python()
+    return chosen is not None and not is_file(chosen)
+
+
 def _chosen_python() -> Path | None:
     """Return the Python chosen by the user, which may be missing, or None."""
     chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")

@@ -9,7 +9,7 @@ from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import draw_over, draw_running, write
 from ..state import folder_trust
-from ..state.next_step import can_mark, has_masks
+from ..state.next_step import can_mark, has_masks, must_use_masks
 
 
 class Tab:
@@ -28,6 +28,8 @@ def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection)
     """Say how an empty list of objects is filled."""
     if not folder_trust.is_accepted(root):
         text = "Objects are listed once the folder is used."
+    elif folder_trust.state_of(root).trained and must_use_masks(folder_trust.state_of(root)):
+        text = "Clean Up Labels gives the splats the objects of the masks."
     elif has_masks(folder_trust.state_of(root)):
         text = "Assign Objects finds the objects by the masks."
     elif folder_trust.state_of(root).trained and can_mark(folder_trust.state_of(root)):

@@ -272,7 +272,8 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
     if job.kind == "sfm":
         _show_poses(job)
     if owner is None or locations.backend_python() is None:
-        messages.show(f"The new capture is in {job.folder}; set up the backend, then import it")
+        first = "set up the backend, then use" if locations.backend_python() is None else "use"
+        messages.show(f"The new capture is in {job.folder}; {first} Import Capture, and open this folder")
         return False
     if job.kind == "sfm":
         folder = reconstruction_for(job.folder, locations.new_reconstruction)

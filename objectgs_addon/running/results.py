@@ -16,7 +16,7 @@ from .. import film, scene
 from ..blender import messages
 from ..environment import known_folders
 from ..process.jobs import Job
-from ..state import object_edits, object_list
+from ..state import folder_trust, object_edits, object_list
 from ..state import viewports as view
 from ..state.folder_state import folder_state
 from .wording import in_blender
@@ -37,6 +37,13 @@ def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
         and scene.folder_of(collection) == folder
         and not scene.is_linked(collection)
     ]
+
+
+def trained_on(capture: Path) -> list[str]:
+    """Return the names of the reconstructions in this file that were trained on a capture."""
+    roots = [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]
+    states = ((root.name, folder_trust.state_of(root)) for root in roots if folder_trust.is_accepted(root))
+    return sorted(name for name, state in states if state.steps and state.capture == capture)
 
 
 def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Collection]:

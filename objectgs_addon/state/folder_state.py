@@ -11,7 +11,7 @@ from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeade
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
 from ...backend.shared.reconstruction.meshes import read_meshes
-from ...backend.shared.reconstruction.record import read_record
+from ...backend.shared.reconstruction.record import Record, read_record
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,7 @@ class FolderState:
         trained: splats exist.
         capture: folder of the capture with the photos, or None.
         pixels: average number of pixels per view.
+        outdated: the training is that of another capture than the present one, for example of other poses.
         agreement: how well the photos agree, in dB, or None.
         meshes: number of meshes.
         stale_meshes: number of meshes made at another training step than the checkpoint's.
@@ -43,6 +44,7 @@ class FolderState:
     pixels: float
     meshes: int
     stale_meshes: int
+    outdated: bool = False
     agreement: float | None = None
     quality: Mapping[str, float] = field(default_factory=dict)
     zero_is_background: bool = False
@@ -98,6 +100,7 @@ def folder_state(folder: Path) -> FolderState:
     header = read_header(paths.checkpoint) or CheckpointHeader(0, 0.0)
     made = _mesh_steps(paths.meshes)
     capture, pixels = _views(paths.folder)
+    record = _record(paths)
     state = FolderState(
         exists=stamp[0] is not None,
         imported=stamp[1] is not None and paths.points.exists(),
@@ -109,7 +112,8 @@ def folder_state(folder: Path) -> FolderState:
         pixels=pixels,
         meshes=len(made),
         stale_meshes=sum(at != header.steps for at in made),
-        agreement=_agreement(paths),
+        outdated=header.steps > 0 and _is_outdated(record),
+        agreement=None if record.capture is None else record.capture.agreement,
         quality=header.quality,
         zero_is_background=header.zero_is_background,
     )
@@ -134,13 +138,20 @@ def _views(folder: Path) -> tuple[Path | None, float]:
     return cameras.capture, sum(sizes) / max(len(sizes), 1)
 
 
-def _agreement(paths: Reconstruction) -> float | None:
-    """Return how well the photos of the capture agree, in dB; None if it is not recorded."""
+def _record(paths: Reconstruction) -> Record:
+    """Return what is recorded of the folder; nothing if that is invalid."""
     try:
-        capture = read_record(paths).capture
+        return read_record(paths)
     except InputError:
-        return None
-    return None if capture is None else capture.agreement
+        return Record()
+
+
+def _is_outdated(record: Record) -> bool:
+    """Return whether the capture has changed since the training; images of another size do not tell."""
+    capture, training = record.capture, record.training
+    if capture is None or training is None or capture.max_size != training.votes.max_size:
+        return False
+    return capture.digest != training.votes.capture
 
 
 def _mesh_steps(folder: Path) -> list[int | None]:

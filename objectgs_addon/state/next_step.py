@@ -45,6 +45,16 @@ ASSIGN = Step(
 )
 TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
 RESUME = Step("objectgs.train", "Resume", "PLAY", "The training was stopped, and goes on from there.")
+RETRAIN = Step(
+    "objectgs.train",
+    "Retrain",
+    "PLAY",
+    "The capture is not that of the training any more, for example after new poses, so the training starts over.",
+    (("restart", True),),
+)
+LABEL = Step(
+    "objectgs.clean_up_labels", "Clean Up Labels", "BRUSH_DATA", "The masks decide which object each splat belongs to."
+)
 MARK = Step(
     "objectgs.start_marking",
     "Mark Objects",
@@ -90,6 +100,10 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     items = root.objectgs.objects
     if not state.trained:
         return TRAIN if items or not has_masks(state) else ASSIGN
+    if state.outdated:
+        return RETRAIN
+    if not items and must_use_masks(state):
+        return LABEL
     if not items and can_mark(state):
         return SEPARATE if any(stroke["object"] for stroke in marks.strokes_of(root)) else MARK
     if items and not state.meshes and not any(item.cleaned for item in items):
@@ -97,6 +111,11 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     if state.steps and not state.meshes:
         return MESHES
     return FILM if scene.render_problem(owner, root) is None else SET_UP_RENDER
+
+
+def must_use_masks(state: FolderState) -> bool:
+    """Return whether splats that were trained without objects can only get those of the capture's masks."""
+    return bool(state.steps) and has_masks(state) and not can_mark(state)
 
 
 def can_mark(state: FolderState) -> bool:

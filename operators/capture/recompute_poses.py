@@ -11,7 +11,7 @@ from bpy.props import IntProperty, StringProperty
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.photos_source import read_source
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import background
+from ...objectgs_addon.running import background, results
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -35,6 +35,19 @@ class RecomputePoses(bpy.types.Operator):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         return need.backend(cls)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        names = results.trained_on(Path(self.capture))
+        if not names:
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self,
+            event,
+            title="Compute the Poses Again?",
+            message=f"The training of {', '.join(names)} cannot go on with other poses; it has to start over.",
+            confirm_text="Compute Poses Again",
+            icon="WARNING",
+        )
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:

@@ -95,7 +95,10 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
         return False
     if is_folder(location):
         return True
-    cls.poll_message_set(f"The capture {location} is missing; put it back, or import it again from where it is now")
+    cls.poll_message_set(
+        f"The capture {location} is missing; put it back, or use Import Capture with its new place, and {folder} as "
+        "Save To"
+    )
     return False
 
 
@@ -176,8 +179,26 @@ def edited(cls: Any, context: bpy.types.Context) -> bool:
     item = object_list.shown_item(root)
     if scene.from_stored(item.object_id) in scene.object_collections(root):
         return True
-    cls.poll_message_set(f"{item.name} has no splats and no mesh yet; train first, or choose another in the list")
+    cls.poll_message_set(why_not_shown(root, item))
     return False
+
+
+def shown_objects(cls: Any, context: bpy.types.Context) -> bool:
+    """Return whether the active reconstruction has a list of objects, and any of them has splats or a mesh."""
+    if not objects(cls, context):
+        return False
+    root = active_root(context)
+    if scene.object_collections(root):
+        return True
+    cls.poll_message_set(why_not_shown(root, object_list.shown_item(root)))
+    return False
+
+
+def why_not_shown(root: bpy.types.Collection, item: Any) -> str:
+    """Return why an object of the list has no splats and no mesh in the scene, and what to do."""
+    if item.chosen and folder_state(scene.folder_of(root)).trained:
+        return f"{item.name} is not shown; use Reload Result, or choose another in the list"
+    return f"{item.name} has no splats and no mesh yet; train first, or choose another in the list"
 
 
 def not_removed(cls: Any, context: bpy.types.Context, addition: str) -> bool:

@@ -4,6 +4,7 @@
 import bpy
 from bpy.props import BoolProperty
 
+from ...backend.shared.errors import InputError
 from ...objectgs_addon import scene
 from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
@@ -32,7 +33,7 @@ class CleanFloaters(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.edited(cls, context)
+        return need.shown_objects(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
@@ -43,6 +44,8 @@ class CleanFloaters(bpy.types.Operator):
             ids = [object_id for item in items if (object_id := scene.from_stored(item.object_id)) in counts]
         else:
             ids = object_list.require_chosen_ids(context, root)
+            if not set(ids) & set(scene.object_collections(root)):
+                raise InputError(need.why_not_shown(root, object_list.shown_item(root)))
         object_edits.clean_floaters(root, ids, not self.restore)
         count = sum(counts.get(object_id, 0) for object_id in ids)
         what = f"floaters of {len(ids)} object{'s' if len(ids) != 1 else ''} {'shown' if self.restore else 'hidden'}"

@@ -61,7 +61,10 @@ class SetUpBackend(bpy.types.Operator):
     def poll(cls, _context: bpy.types.Context) -> bool:
         return _online(cls) and _idle(cls)
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
+        if locations.is_chosen_missing():
+            raise InputError(f"{locations.backend_sentence()} It is Backend Python in the preferences of ObjectGS")
         preferences = locations.preferences()
         device = preferences.device if preferences else "cpu"
         job = environment.set_up_job(locations.base_python(), locations.environment_folder(), device)

@@ -5,6 +5,7 @@ import bpy
 from bpy.props import BoolProperty
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.expectation import PRESET_STEPS
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
@@ -48,6 +49,12 @@ class Train(bpy.types.Operator):
             raise InputError(
                 f"It was already trained for {state.seconds / 60:.1f} minutes; raise Minutes to "
                 "extend the training, or use Retrain"
+            )
+        steps = PRESET_STEPS.get(properties.length)
+        if steps is not None and not self.restart and state.trained and state.steps >= steps:
+            raise InputError(
+                f"It was already trained for {state.steps:,} steps; choose a longer Quality to extend the training, or "
+                "use Retrain"
             )
         length = ("--minutes", f"{properties.minutes:g}") if by_clock else ("--preset", properties.length)
         arguments = ["train", str(state.capture), "--out", str(folder), *length, *planning.arguments(root)]

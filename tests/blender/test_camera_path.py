@@ -3,6 +3,7 @@
 
 import itertools
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ bpy = pytest.importorskip("bpy")
 
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.film.camera_path import path_order
+from objectgs.objectgs_addon.state import folder_trust
+from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import next_step
 
 import headless
@@ -85,3 +88,17 @@ def test_next_step_follows_the_state(root, monkeypatch):
     assert next_step(root, owner).operator == "objectgs.set_up_render"
     bpy.ops.objectgs.set_up_render()
     assert next_step(root, owner).operator == "objectgs.film_frames"
+
+
+def test_next_step_of_a_training_whose_capture_has_changed(root, tmp_path, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    (tmp_path / "capture" / "masks").mkdir(parents=True)
+    trained = replace(UNKNOWN, imported=True, trained=True, steps=100, capture=tmp_path / "capture")
+    root.objectgs.objects.clear()
+    monkeypatch.setattr(folder_trust, "state_of", lambda _: trained)
+    assert next_step(root, bpy.context.scene).operator == "objectgs.clean_up_labels"
+    (tmp_path / "capture" / "masks" / "strokes.json").write_text("{}")
+    assert next_step(root, bpy.context.scene).operator == "objectgs.start_marking"
+    monkeypatch.setattr(folder_trust, "state_of", lambda _: replace(trained, outdated=True))
+    step = next_step(root, bpy.context.scene)
+    assert (step.operator, step.options) == ("objectgs.train", (("restart", True),))

@@ -106,7 +106,9 @@ def _draw_faint(layout: bpy.types.UILayout, text: str) -> None:
 
 
 def _can_resume(state: FolderState, properties: Any) -> bool:
-    return bool(state.steps) and (properties.length != "minutes" or state.seconds < 60 * properties.minutes - 0.5)
+    if properties.length == "minutes":
+        return bool(state.steps) and state.seconds < 60 * properties.minutes - 0.5
+    return 0 < state.steps < PRESET_STEPS.get(properties.length, math.inf)
 
 
 def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, job: Job | None) -> None:
