@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import PureWindowsPath
 
 import numpy as np
+import psutil
 import pycolmap
 import pytest
 from PIL import Image, ImageFilter
@@ -321,17 +322,24 @@ def test_folders_of_others_are_kept(photos, tmp_path, run_command, made):
 
 
 def test_pause_suspends_the_process(monkeypatch):
-    """The child is suspended until the pause ends."""
+    """The child and its children are suspended until the pause ends; on Windows, a child runs the real Python."""
     calls = []
 
     class Child:
-        def __init__(self, _pid): ...
+        def __init__(self, pid):
+            self.pid = pid
+
+        def children(self, recursive):
+            assert recursive
+            return [Child(2), Child(3)]
 
         def suspend(self):
-            calls.append("suspend")
+            if self.pid == 3:
+                raise psutil.NoSuchProcess(3)
+            calls.append(f"suspend {self.pid}")
 
         def resume(self):
-            calls.append("resume")
+            calls.append(f"resume {self.pid}")
 
     monkeypatch.setattr(stages.psutil, "Process", Child)
 
@@ -344,7 +352,7 @@ def test_pause_suspends_the_process(monkeypatch):
             return False
 
     stages._wait_while_paused(type("P", (), {"pid": 1}), type("R", (), {"stop": Request()})())
-    assert calls == ["suspend", "waited", "resume"]
+    assert calls == ["suspend 1", "suspend 2", "waited", "resume 1", "resume 2"]
 
 
 def test_wrong_pose_is_not_trusted(made, tmp_path):
