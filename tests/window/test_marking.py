@@ -184,6 +184,23 @@ def test_marked_objects_get_collections_of_their_own(window, centers):
     assert not asked(window, "pointing.is_active(root)")
 
 
+def test_objects_without_strokes_are_asked_about(window):
+    """A separation keeps only what is marked; it names the others, and Escape leaves all as it is."""
+    ask = script("""
+        with bpy.context.temp_override(**window_context()):
+            result = list(bpy.ops.objectgs.separate_marked("INVOKE_DEFAULT"))
+    """)
+    window.run(script("root.objectgs.active_marked = 0; call(bpy.ops.objectgs.remove_marked_object)"))
+    assert asked(window, "marks.names_without_strokes(root)") == ["Vase"]
+    for key, names in (("Escape", ["Vase", "Object 2"]), ("Return", ["Object 2"])):
+        assert window.run(ask) != ["FINISHED"]
+        window.shot(f"objects-without-strokes-{key}")
+        window.key(key)
+        wait(window, f"[item.name for item in root.objectgs.objects] == {names} and {IDLE}", 240)
+    meshes = "[mesh.name for mesh in bpy.data.meshes if mesh.name.startswith('Vase') and mesh.users]"
+    assert not asked(window, meshes)
+
+
 def test_splats_of_another_program_are_marked(window, centers):
     """A file of splats, without a capture: one stroke, and the object has a collection of its own."""
     file, folder = window.folder / "unlabeled-splats" / "splats.ply", window.folder / "foreign-splats"
