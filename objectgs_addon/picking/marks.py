@@ -146,9 +146,12 @@ def restore(root: bpy.types.Collection, folder: Path) -> None:
              "object": int(each["object"]), "points": each["points"]}
             for each in kept["strokes"]
         ]  # fmt: skip
-        for object_id in sorted({stroke["object"] for stroke in strokes} - {NOTHING}):
-            _add_row(root, object_id).name = str(kept["objects"].get(str(object_id)) or f"Object {object_id}")
-        root.objectgs.everything = bool(kept["everything"])
+        ids = sorted({stroke["object"] for stroke in strokes} - {NOTHING})
+        names = {object_id: str(kept["objects"].get(str(object_id)) or f"Object {object_id}") for object_id in ids}
+        everything = bool(kept["everything"])
+        for object_id, name in names.items():
+            _add_row(root, object_id).name = name
+        root.objectgs.everything = everything
         _store(root, strokes)
 
 

@@ -153,10 +153,11 @@ def test_strokes_of_a_separation_are_shown_again_in_another_file(root, monkeypat
     bpy.ops.objectgs.open_reconstruction(directory=folder)
     again = bpy.context.scene.objectgs.active
     assert marks.content(again) == before
-    (Path(folder) / "strokes.json").write_text('{"strokes": [{}], "everything": 1, "objects": 3}')
-    bpy.ops.wm.read_homefile(use_empty=True)
-    bpy.ops.objectgs.open_reconstruction(directory=folder)
-    assert not bpy.context.scene.objectgs.active.objectgs.marked
+    for damage in ({"strokes": [{}]}, {"objects": 3}):
+        (Path(folder) / "strokes.json").write_text(json.dumps({**before, **damage}))
+        bpy.ops.wm.read_homefile(use_empty=True)
+        bpy.ops.objectgs.open_reconstruction(directory=folder)
+        assert not bpy.context.scene.objectgs.active.objectgs.marked
 
 
 def test_objects_without_strokes_are_named_before_they_are_lost(root, monkeypatch):
