@@ -67,9 +67,19 @@ def merge_tree(shared: sparse.csr_array, total: sparse.csr_array, least: float) 
 
 def merge_regions(shared: sparse.csr_array, total: sparse.csr_array, least: float) -> np.ndarray:
     """Return the merged region (n,) of each region, from 0; the arguments are those of `merge_tree`."""
-    tree = merge_tree(shared, total, least)
-    members = np.arange(tree.regions + len(tree.first))
-    for i in range(len(tree.first) - 1, -1, -1):
+    return cut_tree(merge_tree(shared, total, least), least)
+
+
+def cut_tree(tree: MergeTree, least: float) -> np.ndarray:
+    """Return the merged region (n,) of each region, from 0, where only those with enough in common are merged.
+
+    With a higher `least`, the regions divide those of a lower one.
+    """
+    ratios = np.concatenate([np.full(tree.regions, np.inf), tree.ratios])
+    for i, (first, second) in enumerate(zip(tree.first.tolist(), tree.second.tolist(), strict=True), tree.regions):
+        ratios[i] = min(ratios[i], ratios[first], ratios[second])
+    members = np.arange(len(ratios))
+    for i in np.flatnonzero(ratios[tree.regions :] >= least)[::-1].tolist():
         members[tree.first[i]] = members[tree.second[i]] = members[tree.regions + i]
     return np.unique(members[: tree.regions], return_inverse=True)[1]
 

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..evaluation.images import as_bytes
+from ..labels.regions import MergeTree
 from ..model.generate import Generated
 from ..raster import Camera, devices, object_ranks, rasterize
 from ..shared.errors import InputError
@@ -89,7 +90,7 @@ class Pointer:
         )  # fmt: skip
         self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None
-        self._agreement: np.ndarray | None = None
+        self._regions: MergeTree | None = None
 
     def solve(self, strokes: Strokes) -> np.ndarray:
         """Find the object of each splat.
@@ -120,9 +121,9 @@ class Pointer:
             detail: as for `find_objects`. After the first call, others are answered sooner.
             progress: receives the number of finished trials, and of all.
         """
-        if self._agreement is None:
-            self._agreement = try_regions(self._graph, progress)
-        found = find_objects(self._graph, self._agreement, detail)[self._graph.nearest]
+        if self._regions is None:
+            self._regions = try_regions(self._graph, progress)
+        found = find_objects(self._graph, self._regions, detail)[self._graph.nearest]
         found[self._graph.is_alone] = 0
         used = self._views.used
         places = np.unique(np.linspace(0, len(used) - 1, min(len(used), _PHOTOS)).round().astype(int))

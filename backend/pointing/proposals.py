@@ -8,8 +8,9 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from ..labels.regions import merge_regions, merge_tree, stable_regions
+from ..labels.regions import MergeTree, cut_tree, merge_tree, stable_regions
 from ..shared.defaults import DETAIL
+from ..stereo.scene_planes import find_planes
 from .splat_graph import Edges, SplatGraph, concavity, measure_normals
 
 NEIGHBORS = (35, 45, 55, 65)
@@ -30,19 +31,26 @@ APART = 0.15
 """Regions whose border has a smaller weight on average are never one object: with less, a table may be one with the
 things on it, and with more, walls fall into parts."""
 
+PLANE, BEYOND = 0.03, 1.3
+"""Size of the smallest plane that things stand on or hang at, as a fraction of all photos' pixels; and distance from its
+center up to which it goes on, relative to its reach."""
 
-def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> np.ndarray:
-    """Divide a graph's nodes into regions in several ways.
+
+def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> MergeTree:
+    """Divide a graph's nodes into regions in several ways, and merge the nodes by how often they are in one region.
 
     In each trial, neighboring regions of splats are merged where their border, on average over all of it, is least
-    concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest.
+    concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest. The
+    trials need not agree on large planes: each is one, and none with what is in front of it. What is behind it may be one
+    with it, as the sides of a box with its top.
 
     Args:
         graph: the graph.
         progress: receives the number of finished trials, and of all.
 
     Returns:
-        (m,) float64, for each edge of the graph, the fraction of the trials in which its nodes are in one region.
+        The merges of the nodes. What two regions have in common is the fraction of the trials in which the nodes of the
+        edges between them are in one region; 0 or 1 at large planes.
     """
     edges, count, whole = graph.edges, len(graph.xyz), float(graph.seen.sum())
     _, near = cKDTree(graph.xyz).query(graph.xyz, k=min(max(NEIGHBORS), count), workers=-1)
@@ -60,29 +68,51 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> np
             found = stable_regions(tree, graph.seen, SMALLEST * whole, APART)
             agreeing += (found[edges.first] == found[edges.second]) & (found[edges.first] >= 0)
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
-    return agreeing / (len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
+    agreeing /= len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
+    _settle_planes(graph, measure_normals(graph.xyz[near[:, : NEIGHBORS[1]]], graph.facing), agreeing)
+    return merge_tree(_symmetric(edges, agreeing, count), ones, 0.0)
 
 
-def find_objects(graph: SplatGraph, agreement: np.ndarray, detail: float = DETAIL) -> np.ndarray:
+def find_objects(graph: SplatGraph, tree: MergeTree, detail: float = DETAIL) -> np.ndarray:
     """Find the objects of a graph's nodes.
 
     Args:
         graph: the graph.
-        agreement: (m,) as from `try_regions`.
+        tree: as from `try_regions`.
         detail: the fraction of the trials that must agree that two regions are one, from 0 to 1: more gives more and
-            smaller objects.
+            smaller objects, which divide those of a lower detail.
 
     Returns:
         (n,) int64, the number of each node's object, from 1 by size; 0: none.
     """
-    edges, count, whole = graph.edges, len(graph.xyz), float(graph.seen.sum())
-    ones = _symmetric(edges, np.ones(len(edges.first)), count)
-    found = merge_regions(_symmetric(edges, agreement, count), ones, detail)
-    sizes = np.bincount(found, graph.seen)
+    found = cut_tree(tree, detail)
+    sizes, least = np.bincount(found, graph.seen), SMALLEST * graph.seen.sum()
     number_of = np.zeros(len(sizes), np.int64)
-    kept = [region for region in np.argsort(-sizes, kind="stable").tolist() if sizes[region] >= SMALLEST * whole]
+    kept = [region for region in np.argsort(-sizes, kind="stable").tolist() if sizes[region] >= least]
     number_of[kept] = np.arange(1, len(kept) + 1)
     return number_of[found]
+
+
+def _settle_planes(graph: SplatGraph, normals: np.ndarray, agreement: np.ndarray) -> None:
+    """Make the agreement (m,) 1 within large planes, and 0 between them and what is in front of them.
+
+    Args:
+        graph: the graph of n nodes.
+        normals: (n, 3) normals.
+        agreement: (m,), is changed.
+    """
+    xyz, first, second = graph.xyz, graph.edges.first, graph.edges.second
+    taken = np.zeros(len(xyz), bool)
+    for plane in find_planes(xyz, normals, graph.distances):
+        on = plane.has(xyz, normals, graph.distances) & ~taken
+        on &= np.linalg.norm(xyz - plane.center, axis=1) < BEYOND * plane.reach
+        if graph.seen[on].sum() < PLANE * graph.seen.sum():
+            continue
+        taken |= on
+        side = np.sign(graph.facing[on].sum(0) @ plane.normal)
+        in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
+        agreement[(on[first] & in_front[second]) | (in_front[first] & on[second])] = 0.0
+        agreement[on[first] & on[second]] = 1.0
 
 
 def _symmetric(edges: Edges, values: np.ndarray, count: int) -> sparse.csr_array:

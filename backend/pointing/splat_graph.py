@@ -171,6 +171,7 @@ class SplatGraph:
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
         facing: (n, 3) sum of the directions to the cameras, each as long as the pixels that the node covers there.
+        distances: (n,) mean distance to the cameras, by these pixels.
     """
 
     nodes: np.ndarray
@@ -183,6 +184,7 @@ class SplatGraph:
     xyz: np.ndarray
     seen: np.ndarray
     facing: np.ndarray
+    distances: np.ndarray
 
     @functools.cached_property
     def colors(self) -> ColorModel:
@@ -303,7 +305,7 @@ def build_graph(
         The graph.
     """
     means = devices.host(splats.means).astype(np.float64)
-    seen, facing = np.zeros(len(means)), np.zeros((len(means), 3))
+    seen, away, facing = np.zeros(len(means)), np.zeros(len(means)), np.zeros((len(means), 3))
     in_photos = {}
     counted = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MOST_PHOTOS)).round().astype(int))
     chosen = set(counted[np.unique(np.linspace(0, len(counted) - 1, _PHOTOS).round().astype(int))].tolist())
@@ -313,7 +315,9 @@ def build_graph(
         ones = np.ones((1, small.height, small.width), np.float32)
         weight = downscale**2 * contributions(splats, small, ones, primitive)[:, 0]
         to_camera = camera.center - means
-        facing += weight[:, None] * to_camera / np.maximum(np.linalg.norm(to_camera, axis=1, keepdims=True), 1e-12)
+        distance = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12)
+        facing += (weight / distance)[:, None] * to_camera
+        away += weight * distance
         seen += weight
         if number in chosen:
             in_photos[number] = weight.astype(np.float32)
@@ -328,7 +332,7 @@ def build_graph(
     nearest = np.empty(len(means), np.int64)
     nearest[nodes] = np.arange(len(nodes))
     hidden = np.setdiff1d(np.arange(len(means)), nodes)
-    away, nearest[hidden] = tree.query(means[hidden], workers=-1)
+    from_node, nearest[hidden] = tree.query(means[hidden], workers=-1)
 
     distance, neighbor = tree.query(xyz, k=min(weights.neighbors, len(nodes)), workers=-1)
     normal = measure_normals(xyz[neighbor], facing[nodes])
@@ -340,7 +344,7 @@ def build_graph(
     first, second, length = first[other], second[other], length[other]
     spacing = distance[:, 1:6].mean(1)
     is_alone = np.zeros(len(means), bool)
-    is_alone[hidden] = away > ALONE * spacing[nearest[hidden]]
+    is_alone[hidden] = from_node > ALONE * spacing[nearest[hidden]]
     gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
     color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
     steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
@@ -354,7 +358,10 @@ def build_graph(
     place[order] = np.arange(len(order))
     nodes, nearest, lab, xyz = nodes[order], place[nearest], lab[order], xyz[order]
     between, edges = between[order][:, order], Edges(place[first], place[second], gap, color, steps)
-    return SplatGraph(nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes])
+    return SplatGraph(
+        nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes],
+        away[nodes] / np.maximum(seen[nodes], 1e-12),
+    )  # fmt: skip
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

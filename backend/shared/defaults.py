@@ -3,5 +3,5 @@
 MAX_SIZE = 1600
 """Length of the longer side, in pixels, to which larger images are reduced."""
 
-DETAIL = 0.6
+DETAIL = 0.45
 """How finely scenes are divided into suggested objects: the fraction of the trials that must agree on two being one."""

@@ -36,6 +36,10 @@ class ScenePlane(NamedTuple):
     center: np.ndarray
     reach: float
 
+    def has(self, xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        """Return which points (n,) bool are on the plane; the arguments are those of `find_planes`."""
+        return _inside(xyz, normals, distances, self.normal, self.offset)
+
 
 def find_planes(xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> list[ScenePlane]:
     """Find the planes on which most points are, by random samples of one point each (RANSAC).

@@ -426,7 +426,7 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        *clustered_chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat,
+        *clustered_chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat, np.ones(9),
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -444,7 +444,7 @@ def test_colors_of_what_was_found_decide_where_strokes_do_not(monkeypatch) -> No
     graph = SplatGraph(
         np.arange(12), np.arange(12), np.zeros(12, bool), colors,
         *clustered_chain([1, 1, 1, 1, 1, 3e-4, 1, 1, 1e-3, 1, 1]),
-        Edges(none, none, none, none, none), flat, np.ones(12), flat,
+        Edges(none, none, none, none, none), flat, np.ones(12), flat, np.ones(12),
     )  # fmt: skip
     seeds = {7: np.eye(12)[0], 8: np.eye(12)[11]}
     assert graph.solve(seeds, everything=True).ids.tolist() == [7] * 9 + [8] * 3
@@ -558,7 +558,7 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
     graph = SplatGraph(
-        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, no_clusters(len(xyz)), edges, xyz, ones, normal
+        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, no_clusters(len(xyz)), edges, xyz, ones, normal, ones,
     )
     return graph, truth
 
@@ -568,8 +568,8 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
 def test_things_on_a_table_are_found_without_strokes(balls) -> None:
     graph, truth = table_with_balls(balls)
     calls = []
-    agreement = try_regions(graph, lambda done, total: calls.append((done, total)))
-    found = find_objects(graph, agreement)
+    tree = try_regions(graph, lambda done, total: calls.append((done, total)))
+    found = find_objects(graph, tree)
     assert calls[-1][0] == calls[-1][1] > 1
     for number in range(balls + 1):
         ids, counts = np.unique(found[(truth == number) & (found > 0)], return_counts=True)
@@ -577,7 +577,7 @@ def test_things_on_a_table_are_found_without_strokes(balls) -> None:
         both = ((found == best) & (truth == number)).sum()
         assert both / ((found == best) | (truth == number)).sum() > 0.85, number
     assert found.max() <= balls + 3 and (np.diff(np.bincount(found)[1:]) <= 0).all(), "the largest is the first"
-    pairs = [find_objects(graph, agreement, detail) for detail in (0.3, 0.9)]
+    pairs = [find_objects(graph, tree, detail) for detail in (0.3, 0.9)]
     assert pairs[0].max() <= found.max() <= pairs[1].max()
     coarse, fine = ((each[graph.edges.first], each[graph.edges.second]) for each in pairs)
     both = (fine[0] == fine[1]) & (fine[0] > 0)
