@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from ..labels.regions import MergeTree, cut_tree, merge_tree, stable_regions
 from ..shared.defaults import DETAIL
-from ..stereo.scene_planes import find_planes
+from ..stereo.scene_planes import sides_of_planes
 from .splat_graph import Edges, SplatGraph, concavity, measure_normals
 
 NEIGHBORS = (35, 45, 55, 65)
@@ -31,18 +31,14 @@ APART = 0.15
 """Regions whose border has a smaller weight on average are never one object: with less, a table may be one with the
 things on it, and with more, walls fall into parts."""
 
-PLANE, BEYOND = 0.03, 1.3
-"""Size of the smallest plane that things stand on or hang at, as a fraction of all photos' pixels; and distance from its
-center up to which it goes on, relative to its reach."""
-
 
 def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> MergeTree:
     """Divide a graph's nodes into regions in several ways, and merge the nodes by how often they are in one region.
 
     In each trial, neighboring regions of splats are merged where their border, on average over all of it, is least
     concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest. The
-    trials need not agree on large planes: each is one, and none with what is in front of it. What is behind it may be one
-    with it, as the sides of a box with its top.
+    trials need not agree on large planes: each is one, and not one with what is in front of it. What is behind it may
+    belong to it, as the sides of a box to its top.
 
     Args:
         graph: the graph.
@@ -69,7 +65,10 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
             agreeing += (found[edges.first] == found[edges.second]) & (found[edges.first] >= 0)
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
     agreeing /= len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
-    _settle_planes(graph, measure_normals(graph.xyz[near[:, : NEIGHBORS[1]]], graph.facing), agreeing)
+    normal = measure_normals(graph.xyz[near[:, : NEIGHBORS[1]]], graph.facing)
+    pairs = edges.first, edges.second
+    sides = sides_of_planes(graph.xyz, normal, graph.facing, graph.distances, graph.seen, pairs)
+    agreeing = np.where(sides == 0, agreeing, sides > 0)
     return merge_tree(_symmetric(edges, agreeing, count), ones, 0.0)
 
 
@@ -91,28 +90,6 @@ def find_objects(graph: SplatGraph, tree: MergeTree, detail: float = DETAIL) -> 
     kept = [region for region in np.argsort(-sizes, kind="stable").tolist() if sizes[region] >= least]
     number_of[kept] = np.arange(1, len(kept) + 1)
     return number_of[found]
-
-
-def _settle_planes(graph: SplatGraph, normals: np.ndarray, agreement: np.ndarray) -> None:
-    """Make the agreement (m,) 1 within large planes, and 0 between them and what is in front of them.
-
-    Args:
-        graph: the graph of n nodes.
-        normals: (n, 3) normals.
-        agreement: (m,), is changed.
-    """
-    xyz, first, second = graph.xyz, graph.edges.first, graph.edges.second
-    taken = np.zeros(len(xyz), bool)
-    for plane in find_planes(xyz, normals, graph.distances):
-        on = plane.has(xyz, normals, graph.distances) & ~taken
-        on &= np.linalg.norm(xyz - plane.center, axis=1) < BEYOND * plane.reach
-        if graph.seen[on].sum() < PLANE * graph.seen.sum():
-            continue
-        taken |= on
-        side = np.sign(graph.facing[on].sum(0) @ plane.normal)
-        in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
-        agreement[(on[first] & in_front[second]) | (in_front[first] & on[second])] = 0.0
-        agreement[on[first] & on[second]] = 1.0
 
 
 def _symmetric(edges: Edges, values: np.ndarray, count: int) -> sparse.csr_array:

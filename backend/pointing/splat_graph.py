@@ -1,7 +1,8 @@
 """Splats as a graph: neighbors, and how likely two of them belong to one object.
 
 Two neighbors rather belong to different objects if their colors differ, if their surfaces meet in a concave edge as
-where an object stands on a table, if they are far apart for where they are, or if a photo has an edge between them.
+where an object stands on a table, if they are far apart for where they are, if a photo has an edge between them, or if
+one of them is on a large plane and the other in front of it.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from skimage.color import rgb2lab
 
 from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
+from ..stereo.scene_planes import sides_of_planes
 from .clusters import Clusters, Coarse, between_clusters, nested_clusters
 from .color_model import ColorModel
-from .random_walker import connected_with, random_walker, rough_walker
+from .random_walker import best_borders, connected_with, random_walker, rough_walker
 
 if TYPE_CHECKING:
     from ..model.generate import Generated
@@ -35,6 +37,9 @@ none, if that is farther away than the second number times the local spacing."""
 
 LEAST = 1e-4
 """Least weight of an edge."""
+
+ON_PLANE, IN_FRONT = 3.0, 0.1
+"""Factors of the weights of edges within a large plane, and between it and what is in front of it."""
 
 STROKES, FOUND, CERTAIN = 1e-4, 2e-3, 0.5
 """Weights of the colors of the strokes for each marked object, and of what was found with these, relative to the square
@@ -225,7 +230,8 @@ class SplatGraph:
         known = np.where(is_known & ~self._loose(found, labels, everything), found, -1)
         prior = FOUND * marked**0.5 * self.colors.likeness(known, len(objects)) + outside
         probabilities = self._walk(labels, prior, 1.0, rough if before is None else before.among(objects))
-        found = self._joined(probabilities.argmax(1), labels, everything)
+        found = probabilities.argmax(1) if everything else best_borders(self.weights, probabilities)
+        found = self._joined(found, labels, everything)
         ids = objects[found][self.nearest]
         return Solution(objects, probabilities, ids if everything else np.where(self.is_alone, 0, ids))
 
@@ -351,17 +357,17 @@ def build_graph(
     concave = concavity(xyz, normal, first, second)
     unlike = (weights.color * color) ** 2 + (weights.concave * concave) ** 2
     unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
-    between = sparse.coo_array((LEAST + np.exp(-unlike), (first, second)), shape=(len(nodes), len(nodes))).tocsr()
+    away = away[nodes] / np.maximum(seen[nodes], 1e-12)
+    sides = sides_of_planes(xyz, normal, facing[nodes], away, seen[nodes], (first, second))
+    alike = (LEAST + np.exp(-unlike)) * np.choose(sides + 1, (IN_FRONT, 1.0, ON_PLANE))
+    between = sparse.coo_array((alike, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()
     order, clusters = nested_clusters(between)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    nodes, nearest, lab, xyz = nodes[order], place[nearest], lab[order], xyz[order]
+    nodes, nearest, lab, xyz, away = nodes[order], place[nearest], lab[order], xyz[order], away[order]
     between, edges = between[order][:, order], Edges(place[first], place[second], gap, color, steps)
-    return SplatGraph(
-        nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes],
-        away[nodes] / np.maximum(seen[nodes], 1e-12),
-    )  # fmt: skip
+    return SplatGraph(nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes], away)
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

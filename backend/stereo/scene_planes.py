@@ -16,6 +16,9 @@ _ALIKE = np.cos(np.radians(20.0))
 """Least cosine of the angle between the normals of a point and of its plane."""
 _REACHED = 98
 """Percentile of the distances of a plane's points from their center that is its reach."""
+_LARGE, _BEYOND = 0.03, 1.3
+"""Size of the smallest large plane, as a fraction of all photos' pixels; and distance from its center up to which it
+goes on, relative to its reach."""
 _SAMPLE = 20_000
 _TRIALS = 300
 _ROUNDS = 3
@@ -35,10 +38,6 @@ class ScenePlane(NamedTuple):
     offset: float
     center: np.ndarray
     reach: float
-
-    def has(self, xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> np.ndarray:
-        """Return which points (n,) bool are on the plane; the arguments are those of `find_planes`."""
-        return _inside(xyz, normals, distances, self.normal, self.offset)
 
 
 def find_planes(xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> list[ScenePlane]:
@@ -78,6 +77,42 @@ def find_planes(xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> 
         # Points of a thick or slightly bent surface do not make a second plane.
         rest = ~(np.abs(xyz @ normal - normal @ middle) < 3 * _NEAR * distances)
         xyz, normals, distances = xyz[rest], normals[rest], distances[rest]
+    return found
+
+
+def sides_of_planes(
+    xyz: np.ndarray,
+    normals: np.ndarray,
+    facing: np.ndarray,
+    distances: np.ndarray,
+    seen: np.ndarray,
+    pairs: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """Compare the two points of pairs with the large planes, such as the table that things stand on.
+
+    Args:
+        xyz, normals, distances: n points, as for `find_planes`.
+        facing: (n, 3) mean direction from each point to the cameras, of any length.
+        seen: (n,) pixels that each point covers in all photos.
+        pairs: m points each.
+
+    Returns:
+        (m,) int8: 1 if both points are on one plane, -1 if one is on a plane and the other is in front of it, which is
+        where its cameras are, and otherwise 0. Behind a plane may be what it belongs to, as the sides of a box and its
+        top.
+    """
+    first, second = pairs
+    found, taken = np.zeros(len(first), np.int8), np.zeros(len(xyz), np.bool_)
+    for plane in find_planes(xyz, normals, distances):
+        on = _inside(xyz, normals, distances, plane.normal, plane.offset) & ~taken
+        on &= np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach
+        if seen[on].sum() < _LARGE * seen.sum():
+            continue
+        taken |= on
+        side = np.sign(facing[on].sum(0) @ plane.normal)
+        in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
+        found[(on[first] & in_front[second]) | (in_front[first] & on[second])] = -1
+        found[on[first] & on[second]] = 1
     return found
 
 

@@ -29,7 +29,7 @@ from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects, try_regions
-from backend.pointing.random_walker import connected_with, random_walker, rough_walker
+from backend.pointing.random_walker import best_borders, connected_with, random_walker, rough_walker
 from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
@@ -421,12 +421,31 @@ def test_borders_of_masks_follow_the_photo() -> None:
     assert (follow_edges(photo, np.ones((40, 60, 1), np.float32)) == 0).all()
 
 
+def test_a_label_ends_at_a_weak_edge_near_the_walkers_border() -> None:
+    """The walker's border lies between nodes 4 and 5; a weak edge is a little before it, behind it, or far from it."""
+    towards = np.array([0.99, 0.9, 0.8, 0.7, 0.6, 0.45, 0.4, 0.2, 0.1, 0.05])
+    probabilities = np.column_stack([1 - towards, towards])
+    for weak, last in ((3, 3), (4, 4), (6, 6), (0, 4), (8, 4)):
+        weights = np.ones(9)
+        weights[weak] = 0.4
+        assert best_borders(chain(weights.tolist()), probabilities).tolist() == [1] * (last + 1) + [0] * (9 - last)
+
+
+def test_borders_between_labels_stay_where_the_walker_has_them() -> None:
+    probabilities = np.array(
+        [[0.0, 1, 0], [0.1, 0.8, 0.1], [0.2, 0.5, 0.3], [0.2, 0.3, 0.5], [0.1, 0.1, 0.8], [0, 0, 1]]
+    )
+    assert best_borders(chain([1] * 5), probabilities).tolist() == [1, 1, 1, 2, 2, 2]
+    assert best_borders(chain([1] * 5), probabilities[:, :1]).tolist() == [0] * 6
+
+
 def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     """Two plates far apart; the stroke is on one of them. A part with a similar color elsewhere is not the object's."""
     none, flat = np.zeros(0), np.zeros((9, 3))
     graph = SplatGraph(
         np.arange(9), np.arange(9), np.zeros(9, bool), np.repeat([[50.0, 0, 0], [80.0, 0, 0], [50.0, 0, 0]], 3, axis=0),
-        *clustered_chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none), flat, np.ones(9), flat, np.ones(9),
+        *clustered_chain([1, 1, 1e-4, 1, 1, 1e-4, 1, 1]), Edges(none, none, none, none, none),
+        flat, np.ones(9), flat, np.ones(9),
     )  # fmt: skip
     seeds = {7: np.eye(9)[0]}
     assert graph.solve(seeds).ids.tolist() == [7, 7, 7, 0, 0, 0, 0, 0, 0]
@@ -558,7 +577,7 @@ def table_with_balls(balls: int) -> tuple[SplatGraph, np.ndarray]:
     weights = sparse.csr_array((len(xyz), len(xyz)))
     edges = Edges(first, second, gap, color, color)
     graph = SplatGraph(
-        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, no_clusters(len(xyz)), edges, xyz, ones, normal, ones,
+        nodes, nodes, ones < 0, np.zeros((len(xyz), 3)), weights, no_clusters(len(xyz)), edges, xyz, ones, normal, ones
     )
     return graph, truth
 

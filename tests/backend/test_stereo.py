@@ -16,7 +16,7 @@ from backend.stereo import depth_maps
 from backend.stereo.dense_points import _thinned, find_dense_points
 from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
 from backend.stereo.patch_match import Others, match_planes, packed
-from backend.stereo.scene_planes import find_planes
+from backend.stereo.scene_planes import find_planes, sides_of_planes
 from backend.training.state import model_from_checkpoint, read_checkpoint
 
 SIZE = (160, 120)
@@ -126,6 +126,24 @@ def test_large_planes_are_found_among_points():
         assert sign * plane.offset == pytest.approx(0.5, abs=0.01) and 1.2 < plane.reach < 1.5
     assert all(plane.reach < 0.5 for plane in others)
     assert find_planes(xyz[:0], normals[:0], np.zeros(0)) == []
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.0])
+def test_things_are_in_front_of_a_large_plane_or_behind_it(seen):
+    """A table top, a ball on it, and its side, seen from above or below; planes that few pixels show do not count."""
+    rng = np.random.default_rng(0)
+    top = np.column_stack([rng.uniform(-1, 1, (600, 2)), rng.normal(0, 0.002, 600)])
+    around = rng.normal(size=(300, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    side = np.column_stack([rng.uniform(-1, 1, 100), np.ones(100), rng.uniform(-0.5, -0.1, 100)])
+    xyz = np.concatenate([top, 0.2 * around + [0, 0, 0.25], side])
+    normals = np.concatenate([np.tile([0, 0, 1.0], (600, 1)), around, np.tile([0, 1.0, 0], (100, 1))])
+    pairs = np.array([(0, 1), (0, 700), (700, 0), (700, 701), (0, 950), (950, 951)]).T
+    pixels = np.repeat([seen, 1.0, seen], [600, 300, 100])
+    above = np.array([0, 3.0, 3.0]) - xyz
+    for facing, wanted in ((above, [1, -1, -1, 0, 0, 1]), (above * [1, 1, -1], [1, 0, 0, 0, -1, 1])):
+        found = sides_of_planes(xyz, normals, facing, np.linalg.norm(above, axis=1), pixels, (pairs[0], pairs[1]))
+        assert found.tolist() == (wanted if seen else [0] * 6)
 
 
 @pytest.mark.long
