@@ -37,8 +37,7 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
 
     In each trial, neighboring regions of splats are merged where their border, on average over all of it, is least
     concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest. The
-    trials need not agree on large planes: each is one, and not one with what is in front of it. What is behind it may
-    belong to it, as the sides of a box to its top.
+    trials need not agree on large planes: each is one, and not one with what stands on it, see `sides_of_planes`.
 
     Args:
         graph: the graph.

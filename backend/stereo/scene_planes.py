@@ -97,12 +97,13 @@ def sides_of_planes(
         pairs: m points each.
 
     Returns:
-        (m,) int8: 1 if both points are on one plane, -1 if one is on a plane and the other is in front of it, which is
-        where its cameras are, and otherwise 0. Behind a plane may be what it belongs to, as the sides of a box and its
-        top.
+        (m,) int8: 1 if both points are on one plane; -1 if one is on a plane and the other, with a different normal, is
+        in front of it, which is where its cameras are; otherwise 0. A surface may rise smoothly from a plane, and behind
+        a plane may be what it belongs to, as the sides of a box and its top.
     """
     first, second = pairs
     found, taken = np.zeros(len(first), np.int8), np.zeros(len(xyz), np.bool_)
+    is_bent = (normals[first] * normals[second]).sum(1) < _ALIKE
     for plane in find_planes(xyz, normals, distances):
         on = _inside(xyz, normals, distances, plane.normal, plane.offset) & ~taken
         on &= np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach
@@ -111,7 +112,7 @@ def sides_of_planes(
         taken |= on
         side = np.sign(facing[on].sum(0) @ plane.normal)
         in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
-        found[(on[first] & in_front[second]) | (in_front[first] & on[second])] = -1
+        found[((on[first] & in_front[second]) | (in_front[first] & on[second])) & is_bent] = -1
         found[on[first] & on[second]] = 1
     return found
 

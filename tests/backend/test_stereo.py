@@ -138,7 +138,8 @@ def test_things_are_in_front_of_a_large_plane_or_behind_it(seen):
     side = np.column_stack([rng.uniform(-1, 1, 100), np.ones(100), rng.uniform(-0.5, -0.1, 100)])
     xyz = np.concatenate([top, 0.2 * around + [0, 0, 0.25], side])
     normals = np.concatenate([np.tile([0, 0, 1.0], (600, 1)), around, np.tile([0, 1.0, 0], (100, 1))])
-    pairs = np.array([(0, 1), (0, 700), (700, 0), (700, 701), (0, 950), (950, 951)]).T
+    beside, tilted = 600 + np.argsort(-normals[600:900, 2])[[-1, 0]]  # The normal of the second is almost the table's.
+    pairs = np.array([(0, 1), (0, beside), (beside, 0), (0, tilted), (0, 950), (950, 951)]).T
     pixels = np.repeat([seen, 1.0, seen], [600, 300, 100])
     above = np.array([0, 3.0, 3.0]) - xyz
     for facing, wanted in ((above, [1, -1, -1, 0, 0, 1]), (above * [1, 1, -1], [1, 0, 0, 0, -1, 1])):
