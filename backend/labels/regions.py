@@ -75,13 +75,15 @@ def cut_tree(tree: MergeTree, least: float) -> np.ndarray:
 
     With a higher `least`, the regions divide those of a lower one.
     """
-    ratios = np.concatenate([np.full(tree.regions, np.inf), tree.ratios])
-    for i, (first, second) in enumerate(zip(tree.first.tolist(), tree.second.tolist(), strict=True), tree.regions):
-        ratios[i] = min(ratios[i], ratios[first], ratios[second])
-    members = np.arange(len(ratios))
-    for i in np.flatnonzero(ratios[tree.regions :] >= least)[::-1].tolist():
-        members[tree.first[i]] = members[tree.second[i]] = members[tree.regions + i]
-    return np.unique(members[: tree.regions], return_inverse=True)[1]
+    first, second, ratios = tree.first.tolist(), tree.second.tolist(), [np.inf] * tree.regions
+    # By rounding, two merged regions may have a little more in common than the parts of one of them.
+    for ratio, one, other in zip(tree.ratios.tolist(), first, second, strict=True):
+        ratios.append(min(ratio, ratios[one], ratios[other]))
+    members = list(range(len(ratios)))
+    for i in range(len(first) - 1, -1, -1):
+        if ratios[tree.regions + i] >= least:
+            members[first[i]] = members[second[i]] = members[tree.regions + i]
+    return np.unique(np.array(members[: tree.regions], np.int64), return_inverse=True)[1]
 
 
 def stable_regions(tree: MergeTree, sizes: np.ndarray, smallest: float, least: float) -> np.ndarray:

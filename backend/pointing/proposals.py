@@ -1,4 +1,4 @@
-"""Objects that are found without strokes: regions of splats with concave borders or gaps around them."""
+"""Objects that are found without strokes: regions of splats between large planes, concave borders and gaps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ NEIGHBORS = (35, 45, 55, 65)
 CONCAVE_AND_COLOR = ((4.0, 0.16), (5.0, 0.2))
 """Weights of the concavity and of a tenth of the CIELAB distance of two splats, as for strokes. Colors hardly count,
 since objects have several. Each pair is tried with each number of neighbors, since a single trial is sensitive to its
-weights: it finds 72% of the objects of ten synthetic scenes, and all together 84%."""
+weights."""
+
+_OF_PLANES = 45
+"""The same for planes."""
 
 GAP, STEPS, LEAST = 1 / 3, 0.36, 1e-4
 """Weights of the distance and, relative to that of the color, of the step in the photos; least weight of an edge."""
@@ -64,7 +67,7 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
             agreeing += (found[edges.first] == found[edges.second]) & (found[edges.first] >= 0)
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
     agreeing /= len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
-    normal = measure_normals(graph.xyz[near[:, : NEIGHBORS[1]]], graph.facing)
+    normal = measure_normals(graph.xyz[near[:, :_OF_PLANES]], graph.facing)
     pairs = edges.first, edges.second
     sides = sides_of_planes(graph.xyz, normal, graph.facing, graph.distances, graph.seen, pairs)
     agreeing = np.where(sides == 0, agreeing, sides > 0)

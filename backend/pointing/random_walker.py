@@ -2,7 +2,8 @@
 
 A walker starts at a node and takes each edge with a probability proportional to its weight. The node gets the label of
 the seeds that it most probably reaches first. The probabilities solve one sparse, symmetric and positive definite
-system for each label, here all of them together, by conjugate gradients.
+system for each label, here all of them together, by conjugate gradients. `best_borders` then chooses where
+labels end that no other label stops.
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ ITERATIONS, ITERATIONS_AGAIN, TOLERANCE = 300, 100, 1e-3
 every residual is the third number relative to its right-hand side, in the norm of the corrections: a small residual of
 what is hardly connected is a large error."""
 
-THRESHOLDS, SIZE, ODDS = np.linspace(0.3, 0.97, 41), 0.7, 0.8
+THRESHOLDS, SIZE_POWER, ODDS_POWER = np.linspace(0.3, 0.97, 41), 0.7, 0.8
 """Probabilities of a label against none from which on it may have a node; the powers of the size of what it then has,
 and of the odds of the threshold, so that none far from one half is taken without need."""
+
+_ROUNDING = 1e-9
+"""Weights that are smaller, relative to those of all edges, may be none."""
 
 LEAST = 1e-6
 """Added to what is outside of a cluster, relative to all edges of its nodes."""
@@ -223,7 +227,7 @@ def connected_with(weights: sparse.csr_array, labels: np.ndarray, nodes: np.ndar
 def best_borders(weights: sparse.csr_array, probabilities: np.ndarray) -> np.ndarray:
     """Choose how far each label reaches into what has none, by where its border is weak.
 
-    As in a sweep of local graph partitioning (Andersen, Chung and Lang 2006), a label may have all nodes of more than
+    As in a sweep of local graph partitioning (Andersen, Chung and Lang 2006), a label may have all nodes of at least
     some probability against none. Of these thresholds, the one is taken with the least weights of the border over all
     edges of what is within, a conductance in which the size and the odds of the threshold have a power.
 
@@ -247,15 +251,19 @@ def best_borders(weights: sparse.csr_array, probabilities: np.ndarray) -> np.nda
         return sums.reshape(count, -1)[:, :0:-1].cumsum(1)[:, ::-1]
 
     # An edge is in the border while one end is above the threshold and the other is not, or has another label.
-    first, second = (half := sparse.triu(weights, 1, format="coo")).coords
+    half = sparse.triu(weights, 1, format="coo")
+    first, second = half.coords
     same, is_higher = best[first] == best[second], within[first] >= within[second]
     border = above(first, np.where(same & ~is_higher, -half.data, half.data))
     border += above(second, np.where(same & is_higher, -half.data, half.data))
     edges = np.asarray(weights.sum(axis=1)).ravel()
     inside = above(np.arange(len(best)), edges)
-    smaller = np.maximum(np.minimum(inside, edges.sum() - inside), 1e-12)
+    # Rounding leaves tiny borders and sizes where a label has all nodes, or all that are connected.
+    smaller = np.maximum(np.minimum(inside, edges.sum() - inside), _ROUNDING * edges.sum())
     odds = np.maximum(THRESHOLDS, 1 - THRESHOLDS) / np.minimum(THRESHOLDS, 1 - THRESHOLDS)
-    chosen = (border * odds**ODDS / smaller**SIZE).argmin(1)
+    conductance = np.maximum(border, 0) * odds**ODDS_POWER / smaller**SIZE_POWER
+    conductance[(border <= _ROUNDING * edges.sum()) & (THRESHOLDS < 0.5)] = np.inf
+    chosen = conductance.argmin(1)
     return np.where(within > chosen[best], best, 0)
 
 

@@ -36,7 +36,7 @@ SEEN, ALONE = 1.0, 4.0
 none, if that is farther away than the second number times the local spacing."""
 
 LEAST = 1e-4
-"""Least weight of an edge."""
+"""Least weight of an edge, before the factors of planes."""
 
 ON_PLANE, IN_FRONT = 3.0, 0.1
 """Factors of the weights of edges within a large plane, and between it and what is in front of it."""
@@ -66,7 +66,7 @@ _PHOTOS, _SAMPLES, _VISIBLE = 16, 5, 0.3
 
 
 class Weights(NamedTuple):
-    """What the edges between splats are weighed by: the weight of an edge is exp(-sum of the squares).
+    """What the edges between splats are weighed by: exp(-sum of the squares), before the factors of planes.
 
     Attributes:
         color: weight of a tenth of the CIELAB distance of two splats.
@@ -172,7 +172,7 @@ class SplatGraph:
         lab: (n, 3) CIELAB color of each node, the mean over its neighborhood.
         weights: (n, n) weights of the edges.
         clusters: clusters of the nodes by these weights, in whose order the nodes are.
-        edges: what the weights are made of.
+        edges: what the weights are made of, but for planes.
         xyz: (n, 3) positions of the nodes.
         seen: (n,) pixels that each node covers in all photos together.
         facing: (n, 3) sum of the directions to the cameras, each as long as the pixels that the node covers there.
@@ -311,7 +311,7 @@ def build_graph(
         The graph.
     """
     means = devices.host(splats.means).astype(np.float64)
-    seen, away, facing = np.zeros(len(means)), np.zeros(len(means)), np.zeros((len(means), 3))
+    seen, to_cameras, facing = np.zeros(len(means)), np.zeros(len(means)), np.zeros((len(means), 3))
     in_photos = {}
     counted = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MOST_PHOTOS)).round().astype(int))
     chosen = set(counted[np.unique(np.linspace(0, len(counted) - 1, _PHOTOS).round().astype(int))].tolist())
@@ -323,7 +323,7 @@ def build_graph(
         to_camera = camera.center - means
         distance = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12)
         facing += (weight / distance)[:, None] * to_camera
-        away += weight * distance
+        to_cameras += weight * distance
         seen += weight
         if number in chosen:
             in_photos[number] = weight.astype(np.float32)
@@ -338,7 +338,7 @@ def build_graph(
     nearest = np.empty(len(means), np.int64)
     nearest[nodes] = np.arange(len(nodes))
     hidden = np.setdiff1d(np.arange(len(means)), nodes)
-    from_node, nearest[hidden] = tree.query(means[hidden], workers=-1)
+    away, nearest[hidden] = tree.query(means[hidden], workers=-1)
 
     distance, neighbor = tree.query(xyz, k=min(weights.neighbors, len(nodes)), workers=-1)
     normal = measure_normals(xyz[neighbor], facing[nodes])
@@ -350,24 +350,26 @@ def build_graph(
     first, second, length = first[other], second[other], length[other]
     spacing = distance[:, 1:6].mean(1)
     is_alone = np.zeros(len(means), bool)
-    is_alone[hidden] = from_node > ALONE * spacing[nearest[hidden]]
+    is_alone[hidden] = away > ALONE * spacing[nearest[hidden]]
     gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
     color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
     steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
     concave = concavity(xyz, normal, first, second)
     unlike = (weights.color * color) ** 2 + (weights.concave * concave) ** 2
     unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
-    away = away[nodes] / np.maximum(seen[nodes], 1e-12)
-    sides = sides_of_planes(xyz, normal, facing[nodes], away, seen[nodes], (first, second))
+    distances = to_cameras[nodes] / np.maximum(seen[nodes], 1e-12)
+    sides = sides_of_planes(xyz, normal, facing[nodes], distances, seen[nodes], (first, second))
     alike = (LEAST + np.exp(-unlike)) * np.choose(sides + 1, (IN_FRONT, 1.0, ON_PLANE))
     between = sparse.coo_array((alike, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()
     order, clusters = nested_clusters(between)
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    nodes, nearest, lab, xyz, away = nodes[order], place[nearest], lab[order], xyz[order], away[order]
+    nodes, nearest, lab, xyz, distances = nodes[order], place[nearest], lab[order], xyz[order], distances[order]
     between, edges = between[order][:, order], Edges(place[first], place[second], gap, color, steps)
-    return SplatGraph(nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes], away)
+    return SplatGraph(
+        nodes, nearest, is_alone, lab, between, clusters, edges, xyz, seen[nodes], facing[nodes], distances
+    )
 
 
 def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -91,15 +91,16 @@ def sides_of_planes(
     """Compare the two points of pairs with the large planes, such as the table that things stand on.
 
     Args:
-        xyz, normals, distances: n points, as for `find_planes`.
+        xyz, distances: n points, as for `find_planes`.
+        normals: (n, 3) unit normals, towards the cameras.
         facing: (n, 3) mean direction from each point to the cameras, of any length.
         seen: (n,) pixels that each point covers in all photos.
         pairs: m points each.
 
     Returns:
         (m,) int8: 1 if both points are on one plane; -1 if one is on a plane and the other, with a different normal, is
-        in front of it, which is where its cameras are; otherwise 0. A surface may rise smoothly from a plane, and behind
-        a plane may be what it belongs to, as the sides of a box and its top.
+        in front of it, which is where its cameras are; otherwise 0. A surface may rise smoothly from a plane, and
+        behind a plane may be what it belongs to, as the sides of a box and its top.
     """
     first, second = pairs
     found, taken = np.zeros(len(first), np.int8), np.zeros(len(xyz), np.bool_)

@@ -431,6 +431,15 @@ def test_a_label_ends_at_a_weak_edge_near_the_walkers_border() -> None:
         assert best_borders(chain(weights.tolist()), probabilities).tolist() == [1] * (last + 1) + [0] * (9 - last)
 
 
+def test_a_weak_border_is_found_where_a_label_could_have_all_nodes() -> None:
+    towards = np.array([1.0, 0.9, 0.8, 0.7, 0.6, 0.42])
+    probabilities = np.column_stack([1 - towards, towards])
+    assert best_borders(chain([1, 1, 0.1, 1, 1]), probabilities).tolist() == [1, 1, 1, 0, 0, 0]
+    towards[-1] = 0.55
+    probabilities = np.column_stack([1 - towards, towards])
+    assert best_borders(chain([1] * 5), probabilities).tolist() == [1] * 6, "nothing is below one half"
+
+
 def test_borders_between_labels_stay_where_the_walker_has_them() -> None:
     probabilities = np.array(
         [[0.0, 1, 0], [0.1, 0.8, 0.1], [0.2, 0.5, 0.3], [0.2, 0.3, 0.5], [0.1, 0.1, 0.8], [0, 0, 1]]
