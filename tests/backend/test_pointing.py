@@ -612,6 +612,21 @@ def test_things_on_a_table_are_found_without_strokes(balls) -> None:
     assert both.any() and (coarse[0] == coarse[1])[both].all(), "finer objects divide the coarser ones"
 
 
+@pytest.mark.parametrize("detail", [0.2, 0.9])
+def test_planes_need_no_vote(monkeypatch, detail) -> None:
+    """A table on which all trials agree is two objects where one half of it is in front of the other, a plane."""
+    graph, truth = table_with_balls(1)
+    table, right = truth == 0, graph.xyz[:, 0] > 1
+    first, second = right[graph.edges.first], right[graph.edges.second]
+    counts = []
+    for sides in (np.zeros(len(first)), np.where(first == second, 0, -1)):
+        monkeypatch.setattr("backend.pointing.proposals.sides_of_planes", lambda *_, sides=sides: sides)
+        found = find_objects(graph, try_regions(graph, lambda done, total: None), detail)
+        largest = [np.bincount(found[table & half]).argmax() for half in (right, ~right)]
+        counts.append(len(set(largest)))
+    assert counts == [1, 2]
+
+
 def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_command) -> None:
     scene, out = unlabeled
     result = run_command("propose", out, "--json")
