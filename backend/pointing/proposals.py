@@ -16,13 +16,13 @@ from .splat_graph import Edges, SplatGraph, concavity, measure_normals
 NEIGHBORS = (35, 45, 55, 65)
 """Numbers of neighbors that normals are measured on, more than for strokes, so that plain walls are in one piece."""
 
+_OF_PLANES = 45
+"""Number of neighbors that the normals of planes are measured on."""
+
 CONCAVE_AND_COLOR = ((4.0, 0.16), (5.0, 0.2))
 """Weights of the concavity and of a tenth of the CIELAB distance of two splats, as for strokes. Colors hardly count,
 since objects have several. Each pair is tried with each number of neighbors, since a single trial is sensitive to its
 weights."""
-
-_OF_PLANES = 45
-"""The same for planes."""
 
 GAP, STEPS, LEAST = 1 / 3, 0.36, 1e-4
 """Weights of the distance and, relative to that of the color, of the step in the photos; least weight of an edge."""
@@ -40,7 +40,7 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
 
     In each trial, neighboring regions of splats are merged where their border, on average over all of it, is least
     concave and has the smallest gaps and steps of color; of the tree, the regions are taken that last longest. The
-    trials need not agree on large planes: each is one, and not one with what stands on it, see `sides_of_planes`.
+    trials need not agree on large planes: each is one, and its edges to what stands on it are borders.
 
     Args:
         graph: the graph.
@@ -68,8 +68,7 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
     agreeing /= len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
     normal = measure_normals(graph.xyz[near[:, :_OF_PLANES]], graph.facing)
-    pairs = edges.first, edges.second
-    sides = sides_of_planes(graph.xyz, normal, graph.facing, graph.distances, graph.seen, pairs)
+    sides = sides_of_planes(graph.xyz, normal, graph.distances, graph.seen, (edges.first, edges.second))
     agreeing = np.where(sides == 0, agreeing, sides > 0)
     return merge_tree(_symmetric(edges, agreeing, count), ones, 0.0)
 

@@ -2,8 +2,8 @@
 
 A walker starts at a node and takes each edge with a probability proportional to its weight. The node gets the label of
 the seeds that it most probably reaches first. The probabilities solve one sparse, symmetric and positive definite
-system for each label, here all of them together, by conjugate gradients. `best_borders` then chooses where
-labels end that no other label stops.
+system for each label, here all of them together, by conjugate gradients. `best_borders` then chooses where labels end
+that no other label stops.
 """
 
 from __future__ import annotations

@@ -358,7 +358,7 @@ def build_graph(
     unlike = (weights.color * color) ** 2 + (weights.concave * concave) ** 2
     unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
     distances = to_cameras[nodes] / np.maximum(seen[nodes], 1e-12)
-    sides = sides_of_planes(xyz, normal, facing[nodes], distances, seen[nodes], (first, second))
+    sides = sides_of_planes(xyz, normal, distances, seen[nodes], (first, second))
     alike = (LEAST + np.exp(-unlike)) * np.choose(sides + 1, (IN_FRONT, 1.0, ON_PLANE))
     between = sparse.coo_array((alike, (first, second)), shape=(len(nodes), len(nodes))).tocsr()
     between = between.maximum(between.T).tocsr()

@@ -83,7 +83,6 @@ def find_planes(xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> 
 def sides_of_planes(
     xyz: np.ndarray,
     normals: np.ndarray,
-    facing: np.ndarray,
     distances: np.ndarray,
     seen: np.ndarray,
     pairs: tuple[np.ndarray, np.ndarray],
@@ -93,7 +92,6 @@ def sides_of_planes(
     Args:
         xyz, distances: n points, as for `find_planes`.
         normals: (n, 3) unit normals, towards the cameras.
-        facing: (n, 3) mean direction from each point to the cameras, of any length.
         seen: (n,) pixels that each point covers in all photos.
         pairs: m points each.
 
@@ -108,10 +106,12 @@ def sides_of_planes(
     for plane in find_planes(xyz, normals, distances):
         on = _inside(xyz, normals, distances, plane.normal, plane.offset) & ~taken
         on &= np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach
+        side = np.sign(normals[on].sum(0) @ plane.normal)
+        # The lower side of a thing is not the plane that it lies on.
+        on &= side * (normals @ plane.normal) > 0
         if seen[on].sum() < _LARGE * seen.sum():
             continue
         taken |= on
-        side = np.sign(facing[on].sum(0) @ plane.normal)
         in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
         found[((on[first] & in_front[second]) | (in_front[first] & on[second])) & is_bent] = -1
         found[on[first] & on[second]] = 1

@@ -30,7 +30,7 @@ from backend.pointing.mask_edges import follow_edges
 from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects, try_regions
 from backend.pointing.random_walker import best_borders, connected_with, random_walker, rough_walker
-from backend.pointing.splat_graph import OF_SPLATS, Edges, SplatGraph, contributions
+from backend.pointing.splat_graph import IN_FRONT, OF_SPLATS, ON_PLANE, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
 from backend.pointing.views import views_around, views_of_photos
@@ -625,6 +625,18 @@ def test_planes_need_no_vote(monkeypatch, detail) -> None:
         largest = [np.bincount(found[table & half]).argmax() for half in (right, ~right)]
         counts.append(len(set(largest)))
     assert counts == [1, 2]
+
+
+def test_planes_change_the_weights_of_edges(unlabeled, monkeypatch) -> None:
+    scene, out = unlabeled
+    capture, model = load_capture(scene.folder, out / "cache"), load_model(out / "checkpoint")[0]
+    totals = []
+    for side in (-1, 0, 1):
+        monkeypatch.setattr(
+            "backend.pointing.splat_graph.sides_of_planes", lambda *args, side=side: np.full(len(args[-1][0]), side)
+        )
+        totals.append(pointer_of(capture, model, None)._graph.weights.sum())
+    assert totals[0] / totals[1] == pytest.approx(IN_FRONT) and totals[2] / totals[1] == pytest.approx(ON_PLANE)
 
 
 def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_command) -> None:
