@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from ..labels.regions import MergeTree, cut_tree, merge_tree, stable_regions
 from ..shared.defaults import DETAIL
 from ..stereo.scene_planes import sides_of_planes
-from .splat_graph import Edges, SplatGraph, concavity, measure_normals
+from ..stereo.surface_normals import concavity, measure_normals
+from .splat_graph import Edges, SplatGraph
 
 NEIGHBORS = (35, 45, 55, 65)
 """Numbers of neighbors that normals are measured on, more than for strokes, so that plain walls are in one piece."""

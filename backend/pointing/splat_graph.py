@@ -21,6 +21,7 @@ from skimage.color import rgb2lab
 from ..raster import Camera, devices, rasterize
 from ..shared.splats.spherical_harmonics import C0
 from ..stereo.scene_planes import sides_of_planes
+from ..stereo.surface_normals import bending, concavity, measure_normals, normals_of_depth
 from .clusters import Clusters, Coarse, between_clusters, nested_clusters
 from .color_model import ColorModel
 from .random_walker import best_borders, connected_with, random_walker, rough_walker
@@ -64,6 +65,10 @@ _MOST_PHOTOS = 150
 
 _PHOTOS, _SAMPLES, _VISIBLE = 16, 5, 0.3
 
+_CONVEX, _SHOWN = 0.5, 0.1
+"""Change of the rendered surface's normals along an edge from which on it is convex; and least part of what a splat
+covers whose normals are known and do not cancel each other."""
+
 
 class Weights(NamedTuple):
     """What the edges between splats are weighed by: exp(-sum of the squares), before the factors of planes.
@@ -71,6 +76,8 @@ class Weights(NamedTuple):
     Attributes:
         color: weight of a tenth of the CIELAB distance of two splats.
         concave: weight of the concavity (the change of the normals along the edge).
+        turned: weight of 1 - the cosine of the angle between the normals of the rendered surface, unless it is convex
+            there. Of this and the concavity, the larger one counts. 0: no surface is rendered.
         gap: weight of the distance in units of the local spacing.
         steps: weight of a tenth of the largest CIELAB step in the photos.
         neighbors: number of splats that a normal is measured on, itself included.
@@ -78,15 +85,16 @@ class Weights(NamedTuple):
 
     color: float
     concave: float
+    turned: float
     gap: float
     steps: float
     neighbors: int
 
 
-OF_SPLATS = Weights(color=0.5, concave=12.0, gap=0.5, steps=0.4, neighbors=33)
+OF_SPLATS = Weights(color=0.5, concave=12.0, turned=3.6, gap=0.5, steps=0.4, neighbors=33)
 """Weights for trained splats."""
 
-OF_POINTS = Weights(color=0.7, concave=8.0, gap=1 / 3, steps=0.25, neighbors=17)
+OF_POINTS = Weights(color=0.7, concave=8.0, turned=0.0, gap=1 / 3, steps=0.25, neighbors=17)
 """Weights for the points of a capture, which are fewer and farther apart."""
 
 
@@ -311,15 +319,21 @@ def build_graph(
         The graph.
     """
     means = devices.host(splats.means).astype(np.float64)
-    seen, to_cameras, facing = np.zeros(len(means)), np.zeros(len(means)), np.zeros((len(means), 3))
+    seen, to_cameras = np.zeros(len(means)), np.zeros(len(means))
+    facing, rendered = np.zeros((len(means), 3)), np.zeros((len(means), 3))
     in_photos = {}
     counted = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _MOST_PHOTOS)).round().astype(int))
     chosen = set(counted[np.unique(np.linspace(0, len(counted) - 1, _PHOTOS).round().astype(int))].tolist())
     for done, number in enumerate(counted.tolist(), 1):
         camera = cameras[number]
         small, downscale = reduced(camera)
-        ones = np.ones((1, small.height, small.width), np.float32)
-        weight = downscale**2 * contributions(splats, small, ones, primitive)[:, 0]
+        planes = np.ones((1, small.height, small.width), np.float32)
+        if weights.turned:
+            planes = np.concatenate([planes, _rendered_normals(splats, small, primitive)])
+        shown = downscale**2 * contributions(splats, small, planes, primitive)
+        weight = shown[:, 0]
+        if weights.turned:
+            rendered += shown[:, 1:]
         to_camera = camera.center - means
         distance = np.maximum(np.linalg.norm(to_camera, axis=1), 1e-12)
         facing += (weight / distance)[:, None] * to_camera
@@ -354,8 +368,15 @@ def build_graph(
     gap = length / np.maximum(np.minimum(spacing[first], spacing[second]), 1e-12)
     color = np.linalg.norm(lab[first] - lab[second], axis=1) / 10
     steps = _steps_in_photos(xyz, (first, second), {n: w[nodes] for n, w in in_photos.items()}, cameras, photo) / 10
-    concave = concavity(xyz, normal, first, second)
-    unlike = (weights.color * color) ** 2 + (weights.concave * concave) ** 2
+    bent = weights.concave * concavity(xyz, normal, first, second)
+    if weights.turned:
+        size = np.linalg.norm(rendered[nodes], axis=1, keepdims=True)
+        is_known = size > _SHOWN * seen[nodes, None]
+        surface = np.where(is_known, rendered[nodes] / np.maximum(size, 1e-12), normal)
+        turned = 1 - (surface[first] * surface[second]).sum(1)
+        turned[bending(xyz, surface, first, second) > _CONVEX] = 0.0
+        bent = np.maximum(bent, weights.turned * turned)
+    unlike = (weights.color * color) ** 2 + bent**2
     unlike += (weights.gap * gap) ** 2 + (weights.steps * steps) ** 2
     distances = to_cameras[nodes] / np.maximum(seen[nodes], 1e-12)
     sides = sides_of_planes(xyz, normal, distances, seen[nodes], (first, second))
@@ -372,25 +393,12 @@ def build_graph(
     )
 
 
-def concavity(xyz: np.ndarray, normal: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return how concave the surface is along edges (m,), 0 where it is flat or convex: the change of the normals.
-
-    Args:
-        xyz: (n, 3) positions.
-        normal: (n, 3) normals.
-        first, second: (m,) ends of the edges.
-    """
-    along = xyz[second] - xyz[first]
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    return np.maximum(0.0, -((normal[second] - normal[first]) * along).sum(1))
-
-
-def measure_normals(neighborhoods: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Return the normals (n, 3) of neighborhoods (n, k, 3), on the side of `facing` (n, 3)."""
-    centered = neighborhoods - neighborhoods.mean(1, keepdims=True)
-    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centered, centered))
-    normal = axes[:, :, 0]
-    return np.where((normal * facing).sum(1, keepdims=True) < 0, -normal, normal)
+def _rendered_normals(splats: Generated, camera: Camera, primitive: str) -> np.ndarray:
+    """Return the normals (3, H, W) of the surface that splats show."""
+    with torch.no_grad():
+        drawn = rasterize(*splats[:6], camera, want_depth=True, primitive=primitive)
+    assert drawn.depth is not None
+    return normals_of_depth(devices.host(drawn.depth), devices.host(drawn.alpha), camera)
 
 
 def _steps_in_photos(

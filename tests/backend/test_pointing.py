@@ -639,6 +639,20 @@ def test_planes_change_the_weights_of_edges(unlabeled, monkeypatch) -> None:
     assert totals[0] / totals[1] == pytest.approx(IN_FRONT) and totals[2] / totals[1] == pytest.approx(ON_PLANE)
 
 
+def test_surfaces_that_turn_weaken_edges(unlabeled, monkeypatch) -> None:
+    scene, out = unlabeled
+    capture, model = load_capture(scene.folder, out / "cache"), load_model(out / "checkpoint")[0]
+    turned = pointer_of(capture, model, None)._graph.weights.sum()
+    flat = np.array([0, 0, 1.0])[:, None, None]
+    name = "backend.pointing.splat_graph.normals_of_depth"
+    monkeypatch.setattr(name, lambda depth, *_: flat * np.ones((1, *depth.shape)))
+    unturned = pointer_of(capture, model, None)._graph.weights.sum()
+    monkeypatch.setattr(name, lambda depth, *_: np.zeros((3, *depth.shape)))
+    monkeypatch.setattr("backend.pointing.splat_graph.bending", lambda *args: np.ones(len(args[-1])))
+    convex = pointer_of(capture, model, None)._graph.weights.sum()
+    assert turned < 0.99 * unturned and convex == pytest.approx(unturned)
+
+
 def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_command) -> None:
     scene, out = unlabeled
     result = run_command("propose", out, "--json")

@@ -9,14 +9,17 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 
 from backend.capture.capture import Points, View
+from backend.raster import Camera
 from backend.shared.errors import EXIT_DONE
 from backend.stereo import depth_maps
 from backend.stereo.dense_points import _thinned, find_dense_points
 from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
 from backend.stereo.patch_match import Others, match_planes, packed
 from backend.stereo.scene_planes import find_planes, sides_of_planes
+from backend.stereo.surface_normals import bending, concavity, measure_normals, normals_of_depth
 from backend.training.state import model_from_checkpoint, read_checkpoint
 
 SIZE = (160, 120)
@@ -145,6 +148,54 @@ def test_things_are_in_front_of_a_large_plane_or_behind_it(seen):
         found = sides_of_planes(xyz, normals, np.full(1000, 3.0), pixels, (pairs[0], pairs[1]))
         assert found.tolist() == (wanted if seen else [0] * 6)
         normals[:600] *= -1
+
+
+def test_normals_of_depth_are_exact_on_planes_and_missing_at_gaps():
+    K = np.array([[150.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
+    forward = np.array([0.5, -0.4, -1.0]) / np.linalg.norm([0.5, -0.4, -1.0])
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ [-0.8, 0.6, 2.4]
+    _, depth, on_box = shot(viewmat, K)
+    alpha = np.full(depth.shape, 0.9)
+    alpha[:20] = 0.2
+    found = normals_of_depth((depth * alpha).astype(np.float32), alpha, Camera(viewmat, K, *SIZE))
+    known = (found != 0).any(0)
+    inside = np.zeros_like(known)
+    inside[22:-2, 2:-2] = True
+    for dx, dy in ((2, 0), (-2, 0), (0, 2), (0, -2)):
+        inside &= np.roll(on_box, (dy, dx), (0, 1)) == on_box
+    assert on_box.any() and inside.any() and known[inside].all() and not known[:20].any()
+    np.testing.assert_allclose(found[:, inside].T, np.tile([0, 0, 1.0], (inside.sum(), 1)), atol=2e-3)
+    np.testing.assert_allclose(np.linalg.norm(found[:, known], axis=0), 1, atol=1e-5)
+    assert not normals_of_depth(depth[:4, :4], alpha[:4, :4], Camera(viewmat, K, 4, 4)).any(), "too small"
+
+
+def test_a_gap_has_no_normal():
+    K, (width, height) = np.array([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]]), SIZE
+    depth = np.where(np.arange(width) < 80, 1.0, 2.0) * np.ones((height, 1))
+    found = normals_of_depth(depth, np.ones_like(depth), Camera(np.eye(4), K, width, height))
+    known = (found != 0).any(0)[2:-2, 2:-2]
+    assert not known[:, 76:80].any() and known[:, :76].all() and known[:, 80:].all()
+    np.testing.assert_allclose(found[2, 2:-2, 2:-2][known], -1, atol=1e-6)
+
+
+@pytest.mark.parametrize("slope", [-1.0, 1.0])
+def test_valleys_are_concave_and_ridges_are_not(slope):
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-1, 1, (4000, 2))
+    xyz = np.column_stack([xy, slope * np.abs(xy[:, 0])])
+    _, near = cKDTree(xyz).query(xyz, k=12)
+    normal = measure_normals(xyz[near], np.tile([0, 0, 1.0], (len(xyz), 1)))
+    away = np.abs(xy[:, 0]) > 0.2
+    expected = np.column_stack([-slope * np.sign(xy[:, 0]), np.zeros(len(xy)), np.ones(len(xy))]) / np.sqrt(2)
+    np.testing.assert_allclose(normal[away], expected[away], atol=1e-6)
+    left, right = np.flatnonzero(xy[:, 0] < -0.2)[:500], np.flatnonzero(xy[:, 0] > 0.2)[:500]
+    assert (np.sign(bending(xyz, normal, left, right)) == -slope).all()
+    assert (concavity(xyz, normal, left, right) > 0).all() == (slope > 0)
+    assert np.abs(bending(xyz, normal, left[:-1], left[1:])).max() < 1e-6, "flat"
 
 
 @pytest.mark.long
