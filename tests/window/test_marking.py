@@ -193,7 +193,10 @@ def test_objects_without_strokes_are_asked_about(window):
     window.run(script("root.objectgs.active_marked = 0; call(bpy.ops.objectgs.remove_marked_object)"))
     assert asked(window, "marks.names_without_strokes(root)") == ["Vase"]
     for key, names in (("Escape", ["Vase", "Object 2"]), ("Return", ["Object 2"])):
+        # The question appears where the mouse is, and only after the splats were drawn anew.
+        window.move(600, 450)
         assert window.run(ask) != ["FINISHED"]
+        time.sleep(4)
         window.shot(f"objects-without-strokes-{key}")
         window.key(key)
         wait(window, f"[item.name for item in root.objectgs.objects] == {names} and {IDLE}", 240)
