@@ -1,6 +1,7 @@
 """One ID for each object in all photos, from segments that are numbered in each photo."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -129,11 +130,11 @@ def test_segment_of_two_objects_is_divided_and_points_at_its_border_do_not_count
     assert (object_mask(segments, photo, np.array([0, 1]), objects)[segments == 1] == 1).all()
 
 
-def shuffled(scene, folder):
-    """Replace a capture's masks by those with other numbers in each photo, and return the numbers' true IDs."""
+def shuffled(scene, folder, missing=None):
+    """Replace a capture's masks by those with other numbers in each photo, without the object `missing`."""
     rng = np.random.default_rng(0)
     for name, ids in zip(scene.names, scene.ids, strict=True):
-        present = np.unique(ids[ids > 0])
+        present = np.unique(ids[(ids > 0) & (ids != missing)])
         number = np.zeros(ids.max() + 1, np.uint8)
         number[present] = rng.permutation(len(present)) + 1
         path = folder / "masks" / name
@@ -163,6 +164,33 @@ def test_ids_of_each_photo_become_those_of_objects(write_capture, tmp_path, run_
     assert_rejected(run_command("masks", folder, folder / "masks"), "was made of other masks")
     again = run_command("masks", folder, folder / "masks-given", "--objects", "given", "--json")
     assert again.code == EXIT_DONE and again.events[-1]["result"]["found"] is False
+
+
+def test_objects_keep_their_ids_when_masks_are_made_anew(write_capture, tmp_path, run_command):
+    """The second time one object is missing, and the third time it is there again, and another one is not."""
+    scene = write_capture(views=12, points=200)
+    folder = scene.folder
+    shutil.rmtree(folder / "masks")
+
+    def found_without(missing):
+        given = tmp_path / f"without-{missing}"
+        (given / "masks").mkdir(parents=True)
+        shuffled(scene, given, missing)
+        assert run_command("masks", folder, given / "masks", "--objects", "find").code == EXIT_DONE
+        found = {}
+        for name, ids in zip(scene.names, scene.ids, strict=True):
+            mask = read_mask(folder / "masks" / f"{name}.png")
+            for object_id in np.unique(ids[ids > 0]).tolist():
+                found.setdefault(object_id, []).extend(mask[ids == object_id].tolist())
+        return {object_id: int(np.bincount(shown).argmax()) for object_id, shown in found.items()}
+
+    first = found_without(None)
+    assert sorted(first.values()) == [1, 2, 3]
+    gone = next(object_id for object_id, number in first.items() if number == 1)
+    assert found_without(gone) == {**first, gone: 0}
+    third = found_without(next(object_id for object_id, number in first.items() if number == 3))
+    assert third[gone] == 4, "an ID of an object that was gone is not used again, since edits may be stored for it"
+    assert {third[object_id] for object_id, number in first.items() if number == 2} == {2}
 
 
 def test_regions_get_the_id_that_most_of_their_objects_regions_have(write_capture, tmp_path):

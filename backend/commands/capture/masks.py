@@ -15,17 +15,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...capture.colmap import Model
-from ...capture.files import image_size, read_image, same_shape
+from ...capture.files import image_size, mask_names, read_image, read_mask, same_shape
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
+from ...labels.former_ids import keep_ids
 from ...raster import devices
 from ...segmentation import Finder, PhotoSegments, chosen_checkpoint, finders, is_checkpoint, is_sam3
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
-from ...shared.formats.json_file import write_json
+from ...shared.formats.json_file import read_json, write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
@@ -55,6 +56,14 @@ class _Found(NamedTuple):
 
     ids: dict[str, np.ndarray]
     names: dict[int, str]
+
+
+class _Former(NamedTuple):
+    """The masks that an earlier run made: their files by photo, their IDs by name, and the largest ID of any run."""
+
+    files: dict[str, Path]
+    ids: dict[str, int]
+    largest_id: int
 
 
 def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -91,11 +100,12 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             raise InputError(f"The model in {given} finds no segments in the {len(photos)} photos; use another one.")
         raise InputError(f"{given} shows no object in the {len(photos)} photos that it has masks of; check the masks.")
     reporter.begin(_FIND, "Comparing the segments of the photos")
-    found, association, seen = _objects(segments, model, options.objects, reporter)
+    former = _former(capture, photos)
+    found, association, seen = _objects(segments, model, options.objects, former, reporter)
     if options.text is not None:
         _warn_of_missing(options.text, segments, found, reporter)
     reporter.begin(_WRITE, f"Writing masks of {len(photos)} photos")
-    record = _record(source, given, found, association)
+    record = _record(source, given, found, association, former)
     _write(capture, given, _drawn(segments, found, association, seen, reporter), found, record)
     _report(record, reporter)
     reporter.done(masks=str(capture / "masks"), photos=len(photos), result=record)
@@ -190,11 +200,11 @@ def _checked(source: MaskSource, name: str, images: Path, given: Path) -> Segmen
 
 
 def _objects(
-    segments: dict[str, Segments], model: Model | None, how: str, reporter: StoppingReporter
+    segments: dict[str, Segments], model: Model | None, how: str, former: _Former, reporter: StoppingReporter
 ) -> tuple[_Found, Association | None, dict[str, Seen]]:
     """Return the objects of the segments: those that the source says, or those found by the model's points."""
     seen = {} if model is None else _seen(segments, model)
-    given = None if any(None in found.objects for found in segments.values()) else _given(segments)
+    given = None if any(None in found.objects for found in segments.values()) else _given(segments, former)
     if how == "given" and given is None:
         raise InputError("The masks do not say which segments show the same object; use --objects find.")
     if given is None and model is None:
@@ -213,11 +223,46 @@ def _objects(
             "given keeps the IDs."
         )
     assert model is not None
-    association = associate(list(seen.values()), len(model.xyz))
+    association = _with_former_ids(associate(list(seen.values()), len(model.xyz)), segments, seen, former)
     ids = dict(zip(seen, association.objects, strict=True))
     if not any(part.any() for part in ids.values()):
         raise InputError("No segments of two photos show the same points, so no object was found; check the masks.")
     return _Found(ids, _names(segments, ids)), association, seen
+
+
+def _former(capture: Path, photos: Sequence[str]) -> _Former:
+    """Return the masks that this command, or strokes, have made before."""
+    folder = capture / "masks"
+    if not is_made(folder):
+        return _Former({}, {}, 0)
+    there = {name: [folder / each for each in mask_names(name)[0] if (folder / each).is_file()] for name in photos}
+    files = {name: paths[0] for name, paths in there.items() if paths}
+    try:
+        record = read_json(folder / RECORD)
+        ids = {str(entry["name"]): int(entry["id"]) for entry in record["objects"]}
+        return _Former(files, ids, int(record["largest_id"]))
+    except (InputError, KeyError, TypeError, ValueError):  # A run of an older version, or strokes.
+        return _Former(files, {}, 0)
+
+
+def _with_former_ids(
+    association: Association, segments: dict[str, Segments], seen: dict[str, Seen], former: _Former
+) -> Association:
+    """Return the objects with the IDs that they have in the former masks."""
+    ids, largest = {}, former.largest_id
+    for index, (name, photo) in enumerate(seen.items()):
+        if name not in former.files:
+            continue
+        try:
+            mask = read_mask(former.files[name])
+        except InputError:
+            continue  # It is replaced now, so that it may be damaged.
+        rows, columns = (
+            at * own // whole for at, own, whole in zip(photo.xy.T[::-1], mask.shape, segments[name].numbers.shape)
+        )
+        ids[index] = mask[rows, columns]
+        largest = max(largest, int(mask.max(initial=0)))
+    return keep_ids(association, list(seen.values()), ids, largest + 1)
 
 
 def _warn_of_missing(
@@ -238,12 +283,14 @@ def _listed(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def _given(segments: dict[str, Segments]) -> _Found:
-    """Return the objects that the source says; whole numbers are IDs, and others are numbered in their order."""
+def _given(segments: dict[str, Segments], former: _Former) -> _Found:
+    """Return the objects that the source says; whole numbers are IDs, and others get former or new ones."""
     known = {key for found in segments.values() for key in found.objects}
     numbers: dict[Hashable, int] = {key: key for key in known if isinstance(key, int) and 0 < key <= LARGEST_ID}
     if len(numbers) < len(known):
-        numbers = {key: number for number, key in enumerate(sorted(known, key=str), 1)}
+        new = sorted((key for key in known if key not in former.ids), key=str)
+        numbers = {key: former.ids[key] for key in known if isinstance(key, str) and key in former.ids}
+        numbers |= {key: number for number, key in enumerate(new, former.largest_id + 1)}
     ids = {name: np.array([0, *(numbers[key] for key in found.objects)], np.int64) for name, found in segments.items()}
     texts = {number: key for key, number in numbers.items() if isinstance(key, str)}
     return _Found(ids, {**_names(segments, ids), **texts})
@@ -298,7 +345,9 @@ def _drawn(
         reporter.progress(done, len(segments), what="photos")
 
 
-def _record(source: MaskSource, given: Path, found: _Found, association: Association | None) -> dict[str, Any]:
+def _record(
+    source: MaskSource, given: Path, found: _Found, association: Association | None, former: _Former
+) -> dict[str, Any]:
     """Return the content of masks.json."""
     shown_in = Counter(i for ids in found.ids.values() for i in np.unique(ids).tolist())
     agreement = (
@@ -308,6 +357,7 @@ def _record(source: MaskSource, given: Path, found: _Found, association: Associa
         "source": str(given.resolve()),
         "kind": source.what,
         "found": association is not None,
+        "largest_id": max(former.largest_id, *found.names, 0),
         "objects": [{"id": i, "name": name, "photos": shown_in[i]} for i, name in found.names.items()],
         "agreement": agreement,
     }
