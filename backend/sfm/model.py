@@ -139,9 +139,14 @@ def common_size(model: pycolmap.Reconstruction) -> float:
     return DISTANCE / middle if middle > 0 else 1.0
 
 
-def scale(model: pycolmap.Reconstruction, factor: float) -> None:
-    """Scale a model about its origin."""
-    model.transform(pycolmap.Sim3d(np.column_stack([np.eye(3) * factor, np.zeros(3)])))
+def scaling(factor: float) -> np.ndarray:
+    """Return the similarity transform (3, 4) that scales about the origin."""
+    return np.column_stack([np.eye(3) * factor, np.zeros(3)])
+
+
+def transform(model: pycolmap.Reconstruction, similarity: np.ndarray) -> None:
+    """Apply a similarity transform (3, 4) to a model."""
+    model.transform(pycolmap.Sim3d(similarity))
 
 
 def add_points(model: pycolmap.Reconstruction, xyz: np.ndarray, rgb: np.ndarray) -> None:

@@ -14,11 +14,14 @@ import psutil
 import pycolmap
 import pytest
 from PIL import Image, ImageFilter
+from scipy.spatial.transform import Rotation
 
 from backend.capture import load_capture
 from backend.cli import main as command_line
 from backend.commands.capture import sfm as sfm_command
 from backend.sfm import agreement, check, database, pairs, stages, worker
+from backend.sfm.former_frame import Pose, similarity
+from backend.sfm.model import centers_of
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.shared.formats import photos_source
 
@@ -183,11 +186,50 @@ def test_weak_photos_are_named_and_left_out_by_request(photos, tmp_path, run_com
     assert set(report["figures"]["photo 1.png"]) == {"support", "error", "points"}
     with Image.open(capture / "sfm" / "sfm.png") as picture:
         assert picture.width > 1000
+    moved = pycolmap.Reconstruction(capture / "sparse" / "0")
+    rotation = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
+    moved.transform(pycolmap.Sim3d(np.column_stack([5 * rotation, [1.0, 20.0, 3.0]])))
+    moved.write(capture / "sparse" / "0")
     result = run_command("sfm", folder, "--out", capture, "--leave-out", "photo 3b.png")
     assert result.code == EXIT_DONE
     report = json.loads((capture / "sfm" / "sfm.json").read_text())
     assert report["left_out"] == {"photo 3b.png": "it was left out by request"} and not report["weak"]
     assert report["registered"] == VIEWS and report["photos"] == VIEWS + 1
+    again, former = centers_of(pycolmap.Reconstruction(capture / "sparse" / "0")), centers_of(moved)
+    size = np.ptp(list(former.values()), axis=0).max()
+    away = [np.linalg.norm(again[name] - former[name]) for name in again]
+    assert np.median(away) < 0.01 * size, "the scene has not moved"
+
+
+def poses(count, seed, line=False):
+    rng = np.random.default_rng(seed)
+    centers = rng.normal(size=(count, 3)) * ((1, 0, 0) if line else (1, 1, 1))
+    return {str(i): Pose(center, Rotation.random(random_state=rng).as_matrix()) for i, center in enumerate(centers)}
+
+
+@pytest.mark.parametrize("line", [False, True])
+def test_cameras_are_placed_as_they_were(line):
+    """On a line, only the rotations tell how the cameras were turned about it."""
+    then = poses(20, 0, line)
+    turn, scale, shift = Rotation.from_rotvec([0.4, 2.0, -1.0]), 0.3, np.array([5.0, -1.0, 40.0])
+    rng = np.random.default_rng(1)
+    now = {
+        name: Pose(turn.inv().apply((pose.center - shift) / scale), pose.rotation @ turn.as_matrix())
+        for name, pose in then.items()
+    }
+    now |= {str(i): Pose(rng.normal(size=3) * 30, Rotation.random(random_state=rng).as_matrix()) for i in range(5)}
+    found = similarity(now, then)
+    assert found == pytest.approx(np.column_stack([scale * turn.as_matrix(), shift]), abs=0.02)
+
+
+def test_models_that_have_little_in_common_stay_apart():
+    then = poses(20, 0)
+    assert similarity(then, {name: then[name] for name in list(then)[:2]}) is None
+    assert similarity(then, {name: pose._replace(rotation=np.eye(3)) for name, pose in then.items()}) is None
+    assert (
+        similarity(poses(20, 0), {name: Pose(poses(20, 1)[name].center, then[name].rotation) for name in then}) is None
+    )
+    assert similarity({name: pose._replace(center=np.zeros(3)) for name, pose in then.items()}, then) is None
 
 
 def test_weak_photos_are_those_unlike_the_others():

@@ -14,6 +14,7 @@ import pycolmap
 from ...capture import BLURRED, load_capture, measure_contrasts
 from ...sfm import check, database, model
 from ...sfm.agreement import measure_agreement
+from ...sfm.former_frame import former_poses, poses_of, similarity
 from ...sfm.learned.checkpoint import LOFTR, kind_of
 from ...sfm.learned.lightglue import LightGlue
 from ...sfm.learned.loftr import EfficientLoFTR
@@ -173,8 +174,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     figures = check.figures_of(best.model, best.agreement)
     weak = check.weak_photos(figures)
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
+    _place(best.model, capture, by_gps)
     up = common_up(model.rotations_of(best.model), ups_in_cameras(images, figures))
-    model.scale(best.model, by_gps or model.common_size(best.model))
     model.write_model(best.model, capture)
     on_objects = path.name.endswith(database.ON_OBJECTS)
     weak |= _densify(best.model, capture, on_objects, reporter)
@@ -200,6 +201,21 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     }
     write_json(work / REPORT, report)
     _tell(report, capture, reporter)
+
+
+def _place(found: pycolmap.Reconstruction, capture: Path, by_gps: float | None) -> None:
+    """Scale a model, and place it where that of an earlier run was, since a scene may have been set up there."""
+    former = former_poses(capture) if _had_size_by_gps(capture) == (by_gps is not None) else {}
+    as_before = similarity(poses_of(found), former)
+    model.transform(found, model.scaling(by_gps or model.common_size(found)) if as_before is None else as_before)
+
+
+def _had_size_by_gps(capture: Path) -> bool:
+    """Return whether an earlier run has found the scene's true size."""
+    try:
+        return read_json(capture / WORK / REPORT)["size_by_gps"] is True
+    except (InputError, KeyError, TypeError):
+        return False
 
 
 def _refined(
