@@ -56,6 +56,12 @@ def remove_all(work: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def remove_on_objects(work: Path) -> None:
+    """Remove the databases of features on objects, since the masks are others."""
+    for path in work.glob(f"*{ON_OBJECTS}*"):
+        path.unlink(missing_ok=True)
+
+
 def write_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
     """Write pairs of names as one of COLMAP's lists; the database needs `listed_names` for it."""
     lines = (" ".join(name.replace(" ", _INSTEAD_OF_SPACE) for name in pair) + "\n" for pair in pairs)

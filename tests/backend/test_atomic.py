@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from backend.commands import mask_files
+from backend.capture import made_masks
 from backend.shared.formats import atomic
 
 
@@ -40,14 +40,14 @@ def test_masks_are_kept_if_others_cannot_take_their_place(tmp_path, monkeypatch)
             raise PermissionError(13, "in use")
         part.replace(path)
 
-    monkeypatch.setattr(mask_files, "replace_file", refuse)
+    monkeypatch.setattr(made_masks, "replace_file", refuse)
     for kept in (None, tmp_path / "kept"):
-        with pytest.raises(PermissionError), mask_files.new_masks(tmp_path, kept) as folder:
+        with pytest.raises(PermissionError), made_masks.new_masks(tmp_path, kept) as folder:
             (folder / "a.png").write_bytes(b"new")
         assert [path.name for path in tmp_path.iterdir()] == ["masks"]
         assert (tmp_path / "masks" / "a.png").read_bytes() == b"old"
     monkeypatch.undo()
-    with mask_files.new_masks(tmp_path) as folder:
+    with made_masks.new_masks(tmp_path) as folder:
         (folder / "a.png").write_bytes(b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["masks"]
     assert (tmp_path / "masks" / "a.png").read_bytes() == b"new"

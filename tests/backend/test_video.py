@@ -1,12 +1,14 @@
 """Frames of videos: choice by motion and sharpness, turned, interlaced, HDR and damaged videos, and poses of a walk."""
 
 import json
+import shutil
 
 import av
 import numpy as np
 import pytest
 from PIL import Image, ImageCms, ImageFilter
 
+from backend.capture.files import read_mask
 from backend.sfm.sources import motion, photo_files, photos, video
 from backend.shared.color import hdr
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
@@ -324,6 +326,46 @@ def test_photos_that_changed_are_copied_again(tmp_path):
     assert not (capture / "sfm" / "database.db").exists()
     for name in ("a.jpg", "b.jpg"):
         assert (capture / "images" / name).read_bytes() == (folder / name).read_bytes()
+
+
+def test_copies_are_used_when_the_photos_are_gone(tmp_path):
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    (folder / "day").mkdir(parents=True)
+    for name in ("a.jpg", "day/b.jpg"):
+        heic(folder / name)
+    before = photos.take_photos([folder], capture, None, reporter())
+    (capture / "sfm" / "database.db").write_bytes(b"features")
+    shutil.rmtree(folder)
+    assert photos.take_photos([folder], capture, None, reporter()) == before
+    assert (capture / "sfm" / "database.db").exists()
+    assert not photos.are_copied([folder], tmp_path / "other"), "there are no copies"
+
+
+def test_masks_that_changed_are_copied_again_unless_others_were_made_of_them(tmp_path):
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    (folder / "masks").mkdir(parents=True)
+    (folder / "images").mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / "images" / name)
+
+    def copied(ids, labels):
+        Image.fromarray(np.full((120, 160), ids, np.uint8)).save(folder / "masks" / "a.png")
+        Image.fromarray(np.full((120, 160), 255 * (ids > 1), np.uint8)).save(folder / "masks" / "b.jpg")
+        (folder / "labels.json").write_text(labels)
+        photos.take_photos([folder], capture, None, reporter())
+        there = read_mask(capture / "masks" / "a.png"), read_mask(capture / "masks" / "b.jpg.png")
+        return *(int(mask.max()) for mask in there), (capture / "labels.json").read_text()
+
+    assert copied(1, "{}") == (1, 0, "{}")
+    databases = [capture / "sfm" / name for name in ("database.db", "objects.db", "objects.db-wal")]
+    for path in databases:
+        path.write_bytes(b"features")
+    photos.take_photos([folder], capture, None, reporter())
+    assert all(path.exists() for path in databases)
+    assert copied(3, '{"3": "cup"}') == (3, 1, '{"3": "cup"}')
+    assert [path.exists() for path in databases] == [True, False, False], "features may be on the objects alone"
+    (capture / "masks" / "masks.json").write_text("{}")
+    assert copied(1, '{"1": "mug"}') == (3, 1, '{"3": "cup"}')
 
 
 def test_videos_of_one_name_have_folders_of_their_own(tmp_path):

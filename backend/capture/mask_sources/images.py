@@ -37,21 +37,21 @@ class MaskFiles:
 
     def __init__(self, folder: Path, names: Iterable[str], photos: Path) -> None:
         files, beside = Files(folder), folder.resolve() == photos.resolve()
-        self._files: dict[str, Path] = {}
+        self.files: dict[str, Path] = {}
         for name in names:
             accepted, lossy = mask_names(name, beside)
             if (found := files.first(accepted) or files.first(lossy)) is not None:
-                self._files[name] = found
-        self.photos: Sequence[str] = sorted(self._files)
-        self.lossy = [name for name in self.photos if self._files[name].suffix.lower() in LOSSY_SUFFIXES]
+                self.files[name] = found
+        self.photos: Sequence[str] = sorted(self.files)
+        self.lossy = [name for name in self.photos if self.files[name].suffix.lower() in LOSSY_SUFFIXES]
         self.what = "ID masks"
-        self._labels = {**read_names(folder.parent), **read_names(folder)} if self._files else {}
-        color = [path for path in self._files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
+        self._labels = {**read_names(folder.parent), **read_names(folder)} if self.files else {}
+        color = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
         self._is_color = bool(color) and all(map(is_three_channel, color)) and any(map(is_color_mask, color))
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
-        path = self._files[photo]
+        path = self.files[photo]
         if path.suffix.lower() in LOSSY_SUFFIXES:
             ids = read_black_and_white(path).astype(np.int64)
         else:

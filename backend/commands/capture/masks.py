@@ -16,6 +16,7 @@ import numpy as np
 
 from ...capture.colmap import Model
 from ...capture.files import image_size, mask_names, read_image, read_mask, same_shape
+from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, write_mask
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
@@ -30,7 +31,6 @@ from ...shared.formats.json_file import read_json, write_json
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
-from ..mask_files import RECORD, is_made, kept_masks, new_masks, write_mask
 
 OVERVIEW = "masks.jpg"
 """File in masks/ with a picture of some of them."""

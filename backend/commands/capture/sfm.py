@@ -22,7 +22,7 @@ from ...sfm.location import common_up, meters_per_unit, positions_in_meters, ups
 from ...sfm.pairs import ALL_UP_TO, NEIGHBORS
 from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
-from ...sfm.sources.photos import IMAGES, Photo, take_photos
+from ...sfm.sources.photos import IMAGES, Photo, are_copied, take_photos
 from ...sfm.stages import run_stage
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
@@ -51,7 +51,10 @@ _WORST = 10
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
     sources, capture = options.photos, options.out.absolute()  # COLMAP's processes run in another folder.
-    _require_sources(sources)
+    if are_copied(sources, capture):
+        reporter.warning(f"{_missing(sources)} does not exist any more, so its copies in {capture / IMAGES} are used.")
+    else:
+        _require_sources(sources)
     if options.calibration is not None:
         read_calibration(options.calibration)
     _require_own(sources[0], capture)
@@ -76,11 +79,15 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             raise
 
 
+def _missing(sources: list[Path]) -> Path:
+    return next(path for path in sources if not path.exists())
+
+
 def _require_sources(sources: list[Path]) -> None:
     """Raise InputError unless the sources are a folder, or files of photos and videos."""
+    if not all(path.exists() for path in sources):
+        raise InputError(f"{_missing(sources)} does not exist; choose a folder of photos, or a video.")
     for path in sources:
-        if not path.exists():
-            raise InputError(f"{path} does not exist; choose a folder of photos, or a video.")
         if path.is_dir() and len(sources) > 1:
             raise InputError(f"{path} is a folder beside other photos; choose one folder, or files.")
         if path.is_file() and path.suffix.lower() not in PHOTOS | VIDEOS:
@@ -116,6 +123,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     reporter.begin("photos", "Reading the photos")
     photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter)
     source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
+    if are_copied(made_from.photos, capture):
+        source = images
     unwanted = {name: "it was left out by request" for name in made_from.leave_out}
     photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...capture import Capture, load_capture
+from ...capture.made_masks import REPAIRED, kept_masks, new_masks, write_mask
 from ...labels.renumbering import renumber_masks
 from ...model.generate import Generated
 from ...model.splats import Splats
@@ -23,7 +24,6 @@ from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
 from ..folder import READ, Trained, memory_for_files
 from ..imported import write_labeled
-from ..mask_files import REPAIRED, kept_masks, new_masks, write_mask
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import stage

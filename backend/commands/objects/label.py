@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...capture import Capture, load_capture
+from ...capture.made_masks import new_masks, write_mask
 from ...model.splats import Splats
 from ...planning.decisions import Choices, decide, planned_capture
 from ...pointing.pointer import Pointer
@@ -30,7 +31,6 @@ from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import READ, Trained, memory_for_files, memory_for_targets, outdate_results, plan_of
 from ..imported import write_labeled
-from ..mask_files import new_masks, write_mask
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds

@@ -8,12 +8,13 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, write_image
+from ...capture.made_masks import is_made
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
@@ -30,6 +31,25 @@ _OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)"
 _READS_ALL_NAMES = os.name != "nt"
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
+
+
+class _Stamps:
+    """Size and time of the files that those of a capture were made of, kept in its sfm/."""
+
+    def __init__(self, capture: Path) -> None:
+        self._path = capture / WORK / _FILES
+        self._known: dict[str, list[Any]] = read_json(self._path) if self._path.exists() else {}
+        self._now: dict[str, list[Any]] = {}
+
+    def has_changed(self, name: str, path: Path, *details: Any) -> bool:
+        """Return whether a file, or what else a copy of it depends on, is another than when it was last asked for."""
+        status = path.stat()
+        self._now[name] = [status.st_size, status.st_mtime_ns, *details]
+        return name in self._known and self._known[name] != self._now[name]
+
+    def write(self) -> None:
+        make_folder(self._path.parent)
+        write_json(self._path, {**self._known, **self._now})
 
 
 class Photo(NamedTuple):
@@ -65,8 +85,9 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
 
     Args:
         sources: a folder with photos and videos, also in subfolders, or with a folder images/ and, optionally, masks/
-            and files with names, which are copied, too; or files of photos and videos. Photos named like another one
-            with `_mask` are its masks. Masks that are JPEGs in black and white are written as PNG.
+            and files with names, which are copied, too, again if they have changed; or files of photos and videos.
+            Photos named like another one with `_mask` are its masks. Masks that are JPEGs in black and white are
+            written as PNG. If they are gone, the copies that the capture has are used.
         capture: the capture's folder.
         frames: wanted number of frames of each video; None: by its motion.
         reporter: receives progress and warnings.
@@ -74,6 +95,9 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     Raises:
         InputError: There are fewer than two photos, or too little space on the disk.
     """
+    from_copies = are_copied(sources, capture)
+    if from_copies:
+        sources = [capture / IMAGES]
     source = sources[0]
     if source.is_dir():
         base = source / IMAGES if (source / IMAGES).is_dir() else source
@@ -99,8 +123,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     turn = not in_place and not (source / MASKS).is_dir() and not masked
     photos, unreadable = [], {}
     names: dict[str, str] = {}
-    listed = capture / WORK / _FILES
-    known, files_now = read_json(listed) if listed.exists() else {}, {}
+    stamps = _Stamps(capture)
     for number, path in enumerate(files):
         reporter.progress(number, len(files))
         relative = path.relative_to(base)
@@ -112,9 +135,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             copy = _readable(relative)
             if copy != relative and (in_place or not turn):
                 raise InputError(f"{path.name} is a name that COLMAP cannot read on Windows; use plain letters.")
-            status = path.stat()
-            files_now[name] = [status.st_size, status.st_mtime_ns, turn]
-            is_changed = name in known and known[name] != files_now[name]
+            is_changed = not from_copies and stamps.has_changed(name, path, turn)
             if is_changed:
                 database.remove_all(capture / WORK)
             if not in_place:
@@ -124,8 +145,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             names[name] = relative.as_posix()
         except InputError as error:
             unreadable[name] = str(error)
-    make_folder(listed.parent)
-    write_json(listed, {**known, **files_now})
+    stamps.write()
     stems = Counter(_stem_in(base, path).casefold() for path in videos)
     for path in videos:
         folder = "" if is_alone else _stem_in(base, path)
@@ -144,13 +164,19 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
     if base != source and source.is_dir():
         if not in_place:
-            _copy_rest(source, capture)
+            _copy_rest(source, capture, stamps)
         masks = MaskFiles(source / MASKS, names, base)
-        _write_masks(masks, masks.lossy, names, capture)
+        _write_masks(masks, masks.lossy, names, capture, stamps)
     if masked:
         masks = MaskFiles(base, names, base)
-        _write_masks(masks, masks.photos, names, capture)
+        _write_masks(masks, masks.photos, names, capture, stamps)
+    stamps.write()
     return Taken(photos, unreadable, not files)
+
+
+def are_copied(sources: Sequence[Path], capture: Path) -> bool:
+    """Return whether photos or videos are gone whose copies or frames an earlier run has put into a capture."""
+    return (capture / WORK / _FILES).is_file() and not all(path.exists() for path in sources)
 
 
 def _stem_in(base: Path, path: Path) -> str:
@@ -175,14 +201,26 @@ def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
     return [path for path in paths if path.as_posix() not in masks], bool(masks)
 
 
-def _write_masks(masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path) -> None:
-    """Write the masks of photos to the masks/ of a capture, unless they are there; names: of the photos there."""
+def _write_masks(
+    masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: _Stamps
+) -> None:
+    """Write the masks of photos to the masks/ of a capture; names: of the photos there."""
     for photo in photos:
         suffix, data = encode_mask(ids_of(masks.read(photo)))
         target = capture / MASKS / (names[photo] + suffix)
-        if not target.exists():
+        if _is_missing(target, masks.files[photo], capture, stamps):
+            database.remove_on_objects(capture / WORK)
             make_folder(target.parent)
             write_atomic(target, data)
+
+
+def _is_missing(target: Path, path: Path, capture: Path, stamps: _Stamps) -> bool:
+    """Return whether a mask or list of names is not in the capture, or is one of an earlier state of the given file.
+
+    Masks that were made there of others are not replaced.
+    """
+    has_changed = stamps.has_changed((Path("..") / target.relative_to(capture)).as_posix(), path)
+    return not target.exists() or (has_changed and not is_made(capture / MASKS))
 
 
 def _frames_of(path: Path, capture: Path, folder: str, count: int | None, reporter: StoppingReporter) -> list[str]:
@@ -269,7 +307,7 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
         write_image(target, Image.fromarray((ids > 0).astype(np.uint8) * 255))
 
 
-def _copy_rest(source: Path, capture: Path) -> None:
+def _copy_rest(source: Path, capture: Path, stamps: _Stamps) -> None:
     """Copy masks that are not JPEGs, and files with names, that are beside the photos."""
     masks = source / MASKS
     others = [path for path in source.iterdir() if path.is_file() and _OTHER_FILES.fullmatch(path.name)]
@@ -277,7 +315,8 @@ def _copy_rest(source: Path, capture: Path) -> None:
         if path.suffix.lower() in LOSSY_SUFFIXES:
             continue
         target = capture / path.relative_to(source)
-        if not target.exists():
+        if _is_missing(target, path, capture, stamps):
+            database.remove_on_objects(capture / WORK)
             make_folder(target.parent)
             with atomic_path(target) as part:
                 shutil.copyfile(path, part)

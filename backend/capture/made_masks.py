@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..capture.files import encode_mask
 from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file
 from ..shared.reconstruction.folder import STROKES
+from .files import encode_mask
 
 RECORD, REPAIRED = "masks.json", "repair.json"
 """Files in masks/ with how they were made of other masks, and with what was changed in them."""
