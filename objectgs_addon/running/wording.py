@@ -11,14 +11,22 @@ _NAMES = {
     "--detector": "Detection Model",
     "--frames": "Video Frames",
     "--max-size": "Image Size",
+    "--minutes": "Minutes",
+    "--mode": "Model",
     "--objects": "Objects",
     "--out": "Save To",
     "--restart": "Retrain",
     "--segmenter": "Segmentation Model",
+    "--set": "Set",
     "--strategy": "Assignment",
     "--text": "Names",
 }
 """Options, and the names of their properties or operators."""
+
+_VALUES = {"--mode explicit": "the Model Plain Splats"}
+"""Options with a value that has another name in Blender."""
+_ONLY_TYPED = (", or use the option --overwrite", " or --steps")
+"""Advice that Blender has no property for."""
 
 TRANSFORMERS = "transformers"
 INSTALL = ("objectgs.install_transformers", "Install Transformers")
@@ -39,4 +47,6 @@ def in_blender(sentence: str) -> str:
     """
     if "pip install" in sentence:
         return sentence
+    for phrase, shown in {**dict.fromkeys(_ONLY_TYPED, ""), **_VALUES}.items():
+        sentence = sentence.replace(phrase, shown)
     return _OPTION.sub(lambda found: _NAMES.get(found.group(), found.group()), sentence)

@@ -518,10 +518,16 @@ def test_sentences_have_the_names_that_blender_shows():
     assert in_blender("The folder a--out is full; choose another --out, or --restart.") == (
         "The folder a--out is full; choose another Save To, or Retrain."
     )
+    assert in_blender("The folder a contains files; choose an empty or new folder, or use the option --overwrite.") == (
+        "The folder a contains files; choose an empty or new folder."
+    )
+    assert in_blender("Train it with --mode explicit; specify more --minutes or --steps, or a smaller --set.") == (
+        "Train it with the Model Plain Splats; specify more Minutes, or a smaller Set."
+    )
     assert in_blender("It was trained with --max-size 800; choose a checkpoint as --segmenter.") == (
         "It was trained with Image Size 800; choose a checkpoint as Segmentation Model."
     )
-    for kept in ("--mode explicit", "run pip install torch --out x", "--text-file", "--per-object"):
+    for kept in ("--seed 3", "run pip install torch --out x", "--text-file", "--per-object"):
         assert in_blender(kept) == kept
 
 
