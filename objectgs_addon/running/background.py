@@ -25,7 +25,7 @@ from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
-from ..state.next_step import has_masks
+from ..state.next_step import FIND, find_options, has_masks, is_capture_gone
 from . import pointing, previews, results
 from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
 
@@ -41,7 +41,7 @@ _REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "import-splats": ("objectgs.import_splats", "Choose Another File...", {}),
     "setup": ("objectgs.set_up_backend", "Try Again", {}),
 }
-"""Kind of a failed job -> operator that helps, label of its button and options; other jobs can be tried again."""
+"""Kind of a failed job -> operator that helps, label of its button and options."""
 
 queue = JobQueue()
 _drawn = 0.0
@@ -186,7 +186,7 @@ def redraw() -> None:
 
 
 def _handle_end(job: Job) -> None:
-    operator, label, options = _REMEDIES.get(job.kind, ("objectgs.retry_job", "Try Again", {"number": job.number}))
+    operator, label, options = _remedy(job)
     if job.state is State.FAILED and job.lacks is not None and job.lacks[0] == TRANSFORMERS:
         messages.show(f"{job.title}: {lacking(*job.lacks)}", "ERROR", *INSTALL, number=job.number)
     elif job.state is State.FAILED:
@@ -200,6 +200,16 @@ def _handle_end(job: Job) -> None:
     else:
         _submitted_in.pop(job, None)
         _then.pop(job, None)
+
+
+def _remedy(job: Job) -> tuple[str, str, dict[str, Any]]:
+    """Return what helps if a job fails: an operator, the label of its button and options."""
+    if job.kind in _REMEDIES:
+        return _REMEDIES[job.kind]
+    root = next(iter(results.roots_of(job.folder)), None)
+    if root is not None and is_capture_gone(folder_trust.state_of(root)):
+        return FIND.operator, f"{FIND.label}...", dict(find_options(root))
+    return "objectgs.retry_job", "Try Again", {"number": job.number}
 
 
 def _show_results() -> None:

@@ -27,6 +27,7 @@ class FolderState:
         trained: splats exist.
         capture: folder of the capture with the photos, or None.
         pixels: average number of pixels per view.
+        unfinished: the training was stopped before its end.
         outdated: the training is that of another capture than the present one, for example of other poses.
         agreement: how well the photos agree, in dB, or None.
         meshes: number of meshes.
@@ -44,6 +45,7 @@ class FolderState:
     pixels: float
     meshes: int
     stale_meshes: int
+    unfinished: bool = False
     outdated: bool = False
     agreement: float | None = None
     quality: Mapping[str, float] = field(default_factory=dict)
@@ -112,6 +114,7 @@ def folder_state(folder: Path) -> FolderState:
         pixels=pixels,
         meshes=len(made),
         stale_meshes=sum(at != header.steps for at in made),
+        unfinished=header.steps > 0 and _is_unfinished(record, header),
         outdated=header.steps > 0 and _is_outdated(record),
         agreement=None if record.capture is None else record.capture.agreement,
         quality=header.quality,
@@ -144,6 +147,14 @@ def _record(paths: Reconstruction) -> Record:
         return read_record(paths)
     except InputError:
         return Record()
+
+
+def _is_unfinished(record: Record, header: CheckpointHeader) -> bool:
+    """Return whether the training was to be longer; one until convergence may have ended at any time."""
+    training = record.training
+    if training is None or training.preset == "final":
+        return False
+    return header.steps < (training.steps or 0) or header.seconds < 60 * (training.minutes or 0)
 
 
 def _is_outdated(record: Record) -> bool:

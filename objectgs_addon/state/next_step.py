@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 
@@ -45,6 +45,12 @@ ASSIGN = Step(
 )
 TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
 RESUME = Step("objectgs.train", "Resume", "PLAY", "The training was stopped, and goes on from there.")
+FIND = Step(
+    "objectgs.import_capture",
+    "Find Capture",
+    "VIEWZOOM",
+    "The folder of the photos is not where it was; choose where it is now. What was made of it stays.",
+)
 RETRAIN = Step(
     "objectgs.train",
     "Retrain",
@@ -85,11 +91,32 @@ FILM = Step(
 )
 
 
+_OF_PHOTOS = {ASSIGN, TRAIN, RESUME, RETRAIN, LABEL, MARK, SEPARATE, MESHES}
+"""Steps that read the photos."""
+
+
 def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:
     """Return the step that comes next, or None if the folder of the reconstruction cannot be used.
 
     root: the active reconstruction's collection, or None. owner: the scene that shows it.
     """
+    step = _next_step(root, owner)
+    if root is not None and step in _OF_PHOTOS and is_capture_gone(folder_trust.state_of(root)):
+        return replace(FIND, options=find_options(root))
+    return step
+
+
+def is_capture_gone(state: FolderState) -> bool:
+    """Return whether the folder of the capture does not exist; on another computer, it is not looked for."""
+    return state.capture is not None and not known_folders.is_remote(state.capture) and not is_folder(state.capture)
+
+
+def find_options(root: bpy.types.Collection) -> tuple[tuple[str, object], ...]:
+    """Return the properties by which **Import Capture** gives a reconstruction the new folder of its capture."""
+    return (("folder", str(scene.folder_of(root))), ("max_size", root.objectgs.max_size))
+
+
+def _next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:
     if locations.backend_python() is None:
         return SET_UP
     if root is None:
@@ -102,11 +129,14 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
         return TRAIN if items or not has_masks(state) else ASSIGN
     if state.outdated:
         return RETRAIN
+    cleaned = any(item.cleaned for item in items)
+    if state.unfinished and not state.meshes and not cleaned and not (items and can_mark(state)):
+        return RESUME
     if not items and must_use_masks(state):
         return LABEL
     if not items and can_mark(state):
         return SEPARATE if any(stroke["object"] for stroke in marks.strokes_of(root)) else MARK
-    if items and not state.meshes and not any(item.cleaned for item in items):
+    if items and not state.meshes and not cleaned:
         return CLEAN
     if state.steps and not state.meshes:
         return MESHES

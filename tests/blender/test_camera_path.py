@@ -12,6 +12,8 @@ bpy = pytest.importorskip("bpy")
 
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.film.camera_path import path_order
+from objectgs.objectgs_addon.process.jobs import Job
+from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.state import folder_trust
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import next_step
@@ -102,3 +104,31 @@ def test_next_step_of_a_training_whose_capture_has_changed(root, tmp_path, monke
     monkeypatch.setattr(folder_trust, "state_of", lambda _: replace(trained, outdated=True))
     step = next_step(root, bpy.context.scene)
     assert (step.operator, step.options) == ("objectgs.train", (("restart", True),))
+
+
+def test_next_step_of_a_training_that_was_stopped(root, tmp_path, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    stopped = replace(UNKNOWN, imported=True, trained=True, steps=100, capture=tmp_path, unfinished=True)
+    monkeypatch.setattr(folder_trust, "state_of", lambda _: stopped)
+    (tmp_path / "masks").mkdir()
+    assert next_step(root, bpy.context.scene).label == "Resume"
+    bpy.ops.objectgs.clean_floaters(everything=True)
+    assert next_step(root, bpy.context.scene).operator == "objectgs.extract_meshes", "it is good enough for the user"
+
+
+def test_next_step_is_to_find_a_capture_that_was_moved(root, tmp_path, monkeypatch):
+    """Only where photos are needed."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    capture = tmp_path / "capture"
+    state = replace(UNKNOWN, imported=True, capture=capture)
+    monkeypatch.setattr(folder_trust, "state_of", lambda _: state)
+    step = next_step(root, bpy.context.scene)
+    assert step.label == "Find Capture"
+    assert dict(step.options) == {"folder": str(scene.folder_of(root)), "max_size": root.objectgs.max_size}
+    job = Job("Extract Meshes", "mesh", scene.folder_of(root), ["false"], tmp_path)
+    assert background._remedy(job)[:2] == ("objectgs.import_capture", "Find Capture...")
+    capture.mkdir()
+    assert next_step(root, bpy.context.scene).label == "Train" and background._remedy(job)[1] == "Try Again"
+    state = replace(state, trained=True, steps=100, capture=tmp_path / "gone", meshes=3)
+    bpy.context.scene.view_settings.view_transform = "Raw"
+    assert next_step(root, bpy.context.scene).operator == "objectgs.set_up_render"

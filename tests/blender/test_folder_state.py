@@ -11,6 +11,8 @@ import pytest
 pytest.importorskip("bpy")
 
 from objectgs.backend.shared.reconstruction.cameras import Cameras, CameraView, write_cameras
+from objectgs.backend.shared.reconstruction.folder import Reconstruction
+from objectgs.backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
 from objectgs.objectgs_addon.state.folder_state import folder_state
 
 
@@ -47,6 +49,24 @@ def test_folder_state_follows_each_step(tmp_path):
     assert state.voted and (state.steps, state.seconds) == (700, 12.5) and not state.trained
     (folder / "splats.ply").write_bytes(b"ply")
     assert folder_state(folder).trained
+
+
+@pytest.mark.parametrize(
+    ("length", "unfinished"),
+    [
+        ({"steps": 800}, True),
+        ({"steps": 700}, False),
+        ({"minutes": 0.25}, True),
+        ({"minutes": 0.2}, False),
+        ({"minutes": 5.0, "preset": "final"}, False),
+        ({}, False),
+    ],
+)
+def test_training_that_was_stopped_is_unfinished(tmp_path, length, unfinished):
+    write_checkpoint(tmp_path, 700, 12.5)
+    record = TrainingRecord(settings={}, votes=VotesRecord("majority", None, 800, "0f", None), **length)
+    update_record(Reconstruction(tmp_path), training=record)
+    assert folder_state(tmp_path).unfinished is unfinished
 
 
 def test_quality_is_that_of_the_last_entry_of_the_curve(tmp_path):
