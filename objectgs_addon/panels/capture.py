@@ -15,7 +15,7 @@ from ..running import background
 from ..running.job_display import write
 from ..state import folder_trust
 from ..state.folder_state import folder_state
-from ..state.next_step import IMPORT, RESUME, Step, next_step
+from ..state.next_step import IMPORT, RESUME, Step, find_step, is_capture_gone, next_step
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
@@ -27,8 +27,12 @@ class AddMenu(bpy.types.Menu):
     bl_idname = "OBJECTGS_MT_add"
     bl_label = "Add Reconstruction"
 
-    def draw(self, _context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         _draw_add(self.layout)
+        active = context.scene.objectgs.active
+        if active is not None and is_capture_gone(folder_trust.state_of(active)):
+            self.layout.separator()
+            _draw_button(self.layout, find_step(active))
 
 
 class CapturePanel(Tab, bpy.types.Panel):
@@ -127,9 +131,7 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     if step == IMPORT:
         button = button.column(align=True)
         button.operator("objectgs.import_photos", icon="IMAGE_DATA")
-    operator = button.operator(step.operator, text=step.label, icon=step.icon)
-    for name, value in step.options:
-        setattr(operator, name, value)
+    _draw_button(button, step)
     if jobs:
         _draw_jobs(column, jobs)
     else:
@@ -139,6 +141,12 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     if step.operator == "objectgs.set_up_backend":
         opens = column.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES")
         opens.module = locations.PACKAGE
+
+
+def _draw_button(layout: bpy.types.UILayout, step: Step) -> None:
+    operator = layout.operator(step.operator, text=step.label, icon=step.icon)
+    for name, value in step.options:
+        setattr(operator, name, value)
 
 
 def _draw_display(layout: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:

@@ -25,7 +25,7 @@ from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
 from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
-from ..state.next_step import FIND, find_options, has_masks, is_capture_gone
+from ..state.next_step import find_step, has_masks, is_capture_gone
 from . import pointing, previews, results
 from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
 
@@ -208,7 +208,8 @@ def _remedy(job: Job) -> tuple[str, str, dict[str, Any]]:
         return _REMEDIES[job.kind]
     root = next(iter(results.roots_of(job.folder)), None)
     if root is not None and is_capture_gone(folder_trust.state_of(root)):
-        return FIND.operator, f"{FIND.label}...", dict(find_options(root))
+        step = find_step(root)
+        return step.operator, f"{step.label}...", dict(step.options)
     return "objectgs.retry_job", "Try Again", {"number": job.number}
 
 

@@ -102,7 +102,7 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
     """
     step = _next_step(root, owner)
     if root is not None and step in _OF_PHOTOS and is_capture_gone(folder_trust.state_of(root)):
-        return replace(FIND, options=find_options(root))
+        return find_step(root)
     return step
 
 
@@ -111,9 +111,9 @@ def is_capture_gone(state: FolderState) -> bool:
     return state.capture is not None and not known_folders.is_remote(state.capture) and not is_folder(state.capture)
 
 
-def find_options(root: bpy.types.Collection) -> tuple[tuple[str, object], ...]:
-    """Return the properties by which **Import Capture** gives a reconstruction the new folder of its capture."""
-    return (("folder", str(scene.folder_of(root))), ("max_size", root.objectgs.max_size))
+def find_step(root: bpy.types.Collection) -> Step:
+    """Return the import that gives a reconstruction the new folder of its capture."""
+    return replace(FIND, options=(("folder", str(scene.folder_of(root))), ("max_size", root.objectgs.max_size)))
 
 
 def _next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | None:

@@ -96,8 +96,7 @@ def capture(cls: Any, context: bpy.types.Context) -> bool:
     if is_folder(location):
         return True
     cls.poll_message_set(
-        f"The capture {location} is missing; put it back, or use Import Capture with its new place, and {folder} as "
-        "Save To"
+        f"The capture {location} is missing; put it back, or use Find Capture, in the menu at the top if nowhere else"
     )
     return False
 
