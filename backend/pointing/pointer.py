@@ -17,7 +17,7 @@ from ..shared.reconstruction.objects import default_name
 from .mask_edges import follow_edges
 from .proposals import find_objects, try_regions
 from .splat_graph import Solution, SplatGraph, Weights, build_graph, contributions, reduced
-from .stroke_masks import Segment, extents_away, stroke_pixels
+from .stroke_masks import Segment, stroke_pixels
 from .strokes import PARTS, Stroke, Strokes, stroke_through
 from .views import Views
 
@@ -29,9 +29,6 @@ _PHOTOS, _STROKES, _FEWEST_PIXELS = 16, 3, 30
 
 _EVERYTHING = 0.9
 """Everything belongs to a proposed object if they cover more than this fraction of the photos' pixels."""
-
-_VISIBLE = 0.5
-"""Pixels of a picture that a splat must cover to be seen in it."""
 
 _RANKS = 4
 """Number of objects of a pixel that its mask is decided between."""
@@ -56,16 +53,9 @@ class _Drawn(NamedTuple):
 
 
 class _Shown(NamedTuple):
-    """What the picture of a stroke shows.
-
-    Attributes:
-        splats: (N,) contributions of the splats to the stroke.
-        away: (N,) float32, distance of the splats from the stroke in extents of it; infinite if they are not seen.
-        area: part of the picture of a mask in the stroke's place, or None.
-    """
+    """The (N,) contributions of the splats to a stroke, and the part of the picture of a mask in its place, or None."""
 
     splats: np.ndarray
-    away: np.ndarray
     area: float | None
 
 
@@ -115,17 +105,13 @@ class Pointer:
         self._shown = {each: self._contributions(n, each) for n, each in enumerate(drawn, 1)}
         areas = [shown.area for shown in self._shown.values() if shown.area]
         seeds: dict[int, np.ndarray] = {}
-        away: dict[int, np.ndarray] = {}
         for (stroke, _), shown in self._shown.items():
             # So that each stroke counts as much, however long it is; and each mask as much as it covers, since a splat
             # across the border of two masks belongs to the one that shows more of it.
             weight = shown.area / np.mean(areas) if shown.area else 1.0
             label = _label(stroke)
             seeds[label] = seeds.get(label, 0.0) + weight * shown.splats / shown.splats.sum()
-            if label:
-                away[label] = np.minimum(away.get(label, np.inf), shown.away)
-        away = {label: np.where(np.isfinite(distance), distance, 0.0) for label, distance in away.items()}
-        self._latest = self._graph.solve(seeds, strokes.everything, self._latest, away)
+        self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
         return self._latest.ids // PARTS
 
     def propose(self, detail: float, progress: Callable[[int, int], object]) -> Strokes:
@@ -234,12 +220,10 @@ class Pointer:
         pixels, is_mask = stroke_pixels(
             stroke, drawn.others, (camera.width, camera.height), self._segment, lambda: self._seen(stroke, camera)
         )
-        planes = np.stack([pixels, np.ones(pixels.shape), extents_away(pixels)])
-        found, seen, away = contributions(self.splats, camera, planes, self._primitive).T
+        found = contributions(self.splats, camera, pixels[None], self._primitive)[:, 0]
         if not found.sum() > 0.5:
             raise StrokeOnNothing(number, stroke.view if isinstance(stroke.view, str) else "the viewport")
-        away = np.where(seen > _VISIBLE, away / np.maximum(seen, _VISIBLE), np.inf).astype(np.float32)
-        return _Shown(found, away, float(pixels.mean()) if is_mask else None)
+        return _Shown(found, float(pixels.mean()) if is_mask else None)
 
     def _seen(self, stroke: Stroke, camera: Camera) -> np.ndarray:
         """Return what the user saw while drawing a stroke, (H, W, 3) uint8: the photo, or the splats."""

@@ -49,8 +49,7 @@ which on a node counts as found."""
 
 NOTHING = 1e-4
 """Weight of belonging to no object, relative to all edges of a node and to the fourth root of the number of marked
-objects, unless everything belongs to one. It is added once more for each extent of a stroke by which a node is farther
-from the strokes than one extent, in the pictures that they were drawn in."""
+objects, unless everything belongs to one."""
 
 VOTES = 0.3
 """Weight of the votes of masks where these agree, relative to all edges of a node."""
@@ -210,13 +209,7 @@ class SplatGraph:
         """The graph of the clusters, if there are many."""
         return between_clusters(self.weights, self.clusters)
 
-    def solve(
-        self,
-        seeds: dict[int, np.ndarray],
-        everything: bool = False,
-        before: Solution | None = None,
-        away: dict[int, np.ndarray] | None = None,
-    ) -> Solution:
+    def solve(self, seeds: dict[int, np.ndarray], everything: bool = False, before: Solution | None = None) -> Solution:
         """Find the object of each splat.
 
         Args:
@@ -224,16 +217,13 @@ class SplatGraph:
                 `contributions`; those of 0 belong to no object.
             everything: whether every splat belongs to an object; otherwise, splats far from the strokes have none.
             before: an earlier solution for similar strokes, from which this one begins.
-            away: for each object or part of one, by ID, the distance of the (N,) splats from its strokes, in extents of
-                these; 0 where no picture with a stroke shows them. None: not known.
         """
         objects = np.array(sorted({0, *seeds}))
         nothing = np.zeros(len(self.nearest))
         labels = _seed_labels(np.stack([seeds.get(object_id, nothing)[self.nodes] for object_id in objects.tolist()]))
         marked, outside = len(seeds), np.zeros((len(self.nodes), len(objects)))
         if not everything:
-            farther = np.maximum(np.min(list(away.values()), axis=0)[self.nodes] - 1, 0) if away else 0.0
-            outside[:, 0] = NOTHING * marked**0.25 * (1 + farther) * np.asarray(self.weights.sum(axis=1)).ravel()
+            outside[:, 0] = NOTHING * marked**0.25 * np.asarray(self.weights.sum(axis=1)).ravel()
         prior = STROKES * marked * self.colors.likeness(labels, len(objects)) + outside
         if self.coarse is None:
             rough = self._walk(labels, prior, 1.0)

@@ -26,9 +26,6 @@ _ERODED = 1 / 320
 """Width of a mask's border that is left out, relative to the longer side: masks are a pixel wrong there, and splats at
 outlines belong to both sides."""
 
-_EXTENT = 0.1
-"""Least extent of a stroke, relative to the longer side of its picture: strokes on thin things may be short."""
-
 
 def stroke_pixels(
     stroke: Stroke,
@@ -66,13 +63,6 @@ def stroke_pixels(
     # A thin object may consist of nothing but its border.
     core = inside > border if (inside > border).sum() > 0.5 * mask.sum() else mask
     return (core & ~np.any([*covered, np.zeros_like(own)], axis=0)) | (own & mask), True
-
-
-def extents_away(pixels: np.ndarray) -> np.ndarray:
-    """Return how far each pixel is from those of a stroke (H, W) bool, in extents of these: their larger side."""
-    rows, columns = np.nonzero(pixels)
-    extent = max(np.ptp(rows), np.ptp(columns), _EXTENT * max(pixels.shape))
-    return ndimage.distance_transform_edt(~pixels) / extent
 
 
 def points_on(stroke: Stroke, size: tuple[int, int], most: int) -> np.ndarray:

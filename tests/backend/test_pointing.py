@@ -31,7 +31,7 @@ from backend.pointing.pointer import Pointer
 from backend.pointing.proposals import find_objects, try_regions
 from backend.pointing.random_walker import best_borders, connected_with, random_walker, rough_walker
 from backend.pointing.splat_graph import IN_FRONT, OF_SPLATS, ON_PLANE, Edges, SplatGraph, contributions
-from backend.pointing.stroke_masks import extents_away, points_on, stroke_pixels
+from backend.pointing.stroke_masks import points_on, stroke_pixels
 from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
 from backend.pointing.views import views_around, views_of_photos
 from backend.raster import Camera, object_ranks, rasterize
@@ -463,33 +463,6 @@ def test_far_splats_belong_to_nothing_unless_everything_is_an_object() -> None:
     assert both.ids.tolist() == [7, 7, 7, 8, 8, 8, 8, 8, 8], "the last three only have the color of the first"
     again = graph.solve({**seeds, 8: np.eye(9)[4], 9: np.eye(9)[8]}, True, both)
     assert again.ids.tolist() == [7, 7, 7, 8, 8, 8, 9, 9, 9]
-
-
-def test_an_object_does_not_go_on_far_beyond_its_strokes() -> None:
-    """A chain without any border; what was not seen with a stroke is not far from it."""
-    none, flat = np.zeros(0), np.zeros((20, 3))
-    graph = SplatGraph(
-        np.arange(20), np.arange(20), np.zeros(20, bool), np.tile([50.0, 0, 0], (20, 1)), *clustered_chain([1] * 19),
-        Edges(none, none, none, none, none), flat, np.ones(20), flat, np.ones(20),
-    )  # fmt: skip
-    seeds, away = {7: np.eye(20)[0]}, 1e3 * np.arange(20)
-    assert graph.solve(seeds).ids.tolist() == [7] * 20 == graph.solve(seeds, away={7: np.zeros(20)}).ids.tolist()
-    found = graph.solve(seeds, away={7: away}).ids
-    assert 1 < (found == 7).sum() < 10 and (np.diff(found) <= 0).all(), found
-    assert graph.solve(seeds, True, away={7: away}).ids.tolist() == [7] * 20, "there is nothing else"
-    seeds[8] = np.eye(20)[19]
-    found = graph.solve(seeds, away={7: away, 8: away[::-1]}).ids
-    assert found[0] == 7 and found[19] == 8 and (found[8:12] == 0).all(), "it is far from both"
-
-
-def test_extents_of_strokes() -> None:
-    pixels = np.zeros((100, 200), bool)
-    pixels[50, 40:81] = True
-    away = extents_away(pixels)
-    assert away[50, 60] == 0 and away[50, 120] == pytest.approx(1.0) and away[10, 60] == pytest.approx(1.0)
-    pixels[:] = False
-    pixels[50, 40] = True
-    assert extents_away(pixels)[50, 60] == pytest.approx(1.0), "a click stands for a tenth of the picture"
 
 
 def test_colors_of_what_was_found_decide_where_strokes_do_not(monkeypatch) -> None:
