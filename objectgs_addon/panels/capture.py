@@ -51,7 +51,11 @@ class CapturePanel(Tab, bpy.types.Panel):
         jobs = [
             (index, job)
             for index, job in enumerate(background.queue.jobs)
-            if job.kind in ("sfm", "import", "import-splats", "demo", "setup") and not job.is_finished
+            if not job.is_finished
+            and (
+                job.kind in ("sfm", "import", "import-splats", "demo", "setup")
+                or (active is not None and job.folder == scene.folder_of(active))
+            )
         ]
         if active is not None:
             row = layout.row(align=True)

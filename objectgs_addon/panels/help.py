@@ -13,6 +13,8 @@ STEPS = (
     ("Import Photos or Video", "IMAGE_DATA", "computes where they were taken"),
     ("Import Capture", "IMPORT", "reads photos and their cameras"),
     ("Train", "PLAY", "turns the photos into splats; stop at any time"),
+    ("Mark Objects", "GREASEPENCIL", "without masks: draw over each object"),
+    ("Separate Objects", "CHECKMARK", "gives each marked object its splats"),
     ("Clean Up", "BRUSH_DATA", "hides stray splats"),
     ("Edit", "OUTLINER_COLLECTION", "changes the object that you click"),
     ("Extract Meshes", "MESH_DATA", "for shadows, physics, other programs"),

@@ -27,7 +27,8 @@ from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
 from ..state.next_step import find_step, has_masks, is_capture_gone
 from . import pointing, previews, results
-from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
+from .job_display import after_stop
+from .wording import IMPORT_PHOTOS, INSTALL, TRANSFORMERS, in_blender, lacking
 
 INTERVAL = 0.1
 """Time in seconds between two polls of the queue."""
@@ -195,6 +196,8 @@ def _handle_end(job: Job) -> None:
         messages.show(f"{job.title}: {in_blender(job.error or job.message)}", "ERROR", operator, label, **options)
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
+    elif job.state is State.STOPPED and job.kind == "sfm":
+        messages.show(after_stop(job))
     if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "label", "mesh")):
         _results.append(job)
     else:
@@ -204,6 +207,9 @@ def _handle_end(job: Job) -> None:
 
 def _remedy(job: Job) -> tuple[str, str, dict[str, Any]]:
     """Return what helps if a job fails: an operator, the label of its button and options."""
+    if job.kind == "import" and job.error and IMPORT_PHOTOS in job.error:
+        folder = job.command[job.command.index("import") + 1]
+        return _REMEDIES["sfm"][0], "Import Photos of This Folder...", {"directory": folder}
     if job.kind in _REMEDIES:
         return _REMEDIES[job.kind]
     root = next(iter(results.roots_of(job.folder)), None)

@@ -22,6 +22,7 @@ _AFTER_STOP = {
     "train": " Resume continues it.",
     "mesh": " Extract Meshes continues it.",
     "film": " Render Film Frames continues it.",
+    "sfm": " Import Photos or Video continues it with the same photos.",
 }
 """Kind of a stopped job -> what to do next; others start anew."""
 
@@ -89,23 +90,32 @@ def draw_figures(
         write(layout, "   ".join(figures))
 
 
+def after_stop(job: Job) -> str:
+    """Return a sentence about a stopped job."""
+    return f"{job.title}: stopped.{_AFTER_STOP.get(job.kind, '')}"
+
+
 def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
     """Draw the outcome of a finished job and up to three warnings."""
     if job.state is State.FAILED:
         write(layout, f"{job.title} failed. {in_blender(job.error or job.message)}", "ERROR")
     elif job.state is State.STOPPED:
-        write(layout, f"{job.title}: stopped.{_AFTER_STOP.get(job.kind, '')}", "INFO")
+        write(layout, after_stop(job), "INFO")
     else:
         write(layout, f"{job.title}: done", "CHECKMARK")
     for sentence in job.warnings[:3]:
         write(layout, in_blender(sentence), "ERROR")
 
 
-def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE", inset: float = 0.0) -> None:
-    """Draw `text`, wrapped to the width of the current region less `inset` pixels at a UI scale of 1."""
+def write(layout: bpy.types.UILayout, text: str, icon: str = "NONE", inset: float = 0.0, rows: int = 0) -> None:
+    """Draw `text`, wrapped to the width of the current region less `inset` pixels at a UI scale of 1.
+
+    It takes at least this number of rows, so that what is below does not move when the text changes.
+    """
     scale = bpy.context.preferences.system.ui_scale
     width = max(20, int((bpy.context.region.width / scale - AROUND - inset) / CHARACTER))
     column = layout.column(align=True)
-    for line in textwrap.wrap(text, width):
+    lines = textwrap.wrap(text, width)
+    for line in lines + [""] * (rows - len(lines)):
         column.label(text=line, icon=icon)
         icon = icon if icon == "NONE" else "BLANK1"

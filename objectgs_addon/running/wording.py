@@ -25,8 +25,11 @@ _NAMES = {
 
 _VALUES = {"--mode explicit": "the Model Plain Splats"}
 """Options with a value that has another name in Blender."""
-_ONLY_TYPED = (", or use the option --overwrite", " or --steps")
+_ONLY_TYPED = (" (on the command line: `sfm`)", ", or use the option --overwrite", " or --steps")
 """Advice that Blender has no property for."""
+
+IMPORT_PHOTOS = "Import Photos or Video"
+"""What the backend names where photos have no cameras yet."""
 
 TRANSFORMERS = "transformers"
 INSTALL = ("objectgs.install_transformers", "Install Transformers")

@@ -15,7 +15,9 @@ from ..common import need
 from ..common.import_dialog import ImportDialog
 from ..common.reporting import reports_errors
 
-_FILES = "*.json;*.xml"
+_FILES = ("*.json", "*.xml")
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr", ".npy", ".npz")
+"""Suffixes of masks, of which one stands for the whole folder."""
 
 
 class ImportMasks(ImportDialog, bpy.types.Operator):
@@ -29,7 +31,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     filepath: StringProperty(name="Masks", subtype="FILE_PATH", description="File, or folder, with the masks")
-    filter_glob: StringProperty(default=_FILES, options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join([*_FILES, *(f"*{suffix}" for suffix in _IMAGES)]), options={"HIDDEN"})
     objects: EnumProperty(
         name="Objects",
         description="Which segments show the same object",
@@ -59,9 +61,10 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         given = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else None
-        if given is not None and not given.exists() and given.parent.is_dir():
-            # The file browser adds a name to the folder that it shows.
-            given = given.parent
+        if given is not None and given.parent.is_dir():
+            # The file browser adds a name to the folder that it shows, and may take that of the open .blend.
+            is_one_of_many = given.is_file() and given.suffix.lower() in (*_IMAGES, ".blend")
+            given = given.parent if is_one_of_many or not given.exists() else given
         if given is None or not given.exists():
             raise InputError(f"{given or 'The file of the masks'} does not exist; choose another")
         root = need.active_root(context)

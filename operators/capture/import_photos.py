@@ -76,7 +76,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
             self.layout.prop(self, "cameras")
         self.layout.prop(self, "features")
         self.layout.prop(self, "frames")
-        names = [file.name for file in self.files if file.name]
+        names = self._names()
         self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else "All in the folder")
 
     @reports_errors
@@ -98,7 +98,11 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         folder = Path(bpy.path.abspath(self.directory)).resolve() if self.directory else None
         if folder is None or not folder.is_dir():
             raise InputError(f"The folder {folder or 'of the photos'} does not exist; choose another")
-        return sorted(folder / file.name for file in self.files if file.name) or [folder]
+        return sorted(folder / name for name in self._names()) or [folder]
+
+    def _names(self) -> list[str]:
+        """Return the names of the selected photos and videos; the file browser adds that of the open .blend."""
+        return [file.name for file in self.files if Path(file.name).suffix.lower() in PHOTOS | VIDEOS]
 
 
 CLASSES = (ImportPhotos,)

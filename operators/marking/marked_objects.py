@@ -11,7 +11,7 @@ from ...backend.shared.formats.json_file import write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.picking import marks
+from ...objectgs_addon.picking import marking_tool, marks
 from ...objectgs_addon.running import background, pointing
 from ..common import need
 from ..common.reporting import reports_errors
@@ -149,6 +149,8 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
             str(strokes),
             *locations.segmenter_options(),
         )
+        # A click then selects the object that it has become.
+        marking_tool.leave(context)
         return background.submit(job, context.scene, self.report)
 
 

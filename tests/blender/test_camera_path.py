@@ -128,6 +128,11 @@ def test_next_step_is_to_find_a_capture_that_was_moved(root, tmp_path, monkeypat
     job = Job("Extract Meshes", "mesh", scene.folder_of(root), ["false"], tmp_path)
     assert background._remedy(job)[:2] == ("objectgs.import_capture", "Find Capture...")
     capture.mkdir()
+    photos = Job("Import a", "import", tmp_path, ["python", "-m", "backend", "import", "/a", "--out", "b"], tmp_path)
+    photos.error = "/a contains 9 photos, but not where they were taken; compute that with Import Photos or Video."
+    assert background._remedy(photos)[::2] == ("objectgs.import_photos", {"directory": "/a"})
+    photos.error = "/a is damaged."
+    assert background._remedy(photos)[0] == "objectgs.import_capture"
     assert next_step(root, bpy.context.scene).label == "Train" and background._remedy(job)[1] == "Try Again"
     state = replace(state, trained=True, steps=100, capture=tmp_path / "gone", meshes=3)
     bpy.context.scene.view_settings.view_transform = "Raw"

@@ -69,9 +69,14 @@ def test_names_are_asked_for_with_the_model_of_the_preferences(root, submitted, 
 def test_folder_is_chosen_with_or_without_a_name_in_it(root, submitted, tmp_path):
     given = tmp_path / "segments"
     given.mkdir()
-    for path in (f"{given}/", f"{given}/untitled"):
+    (given / "a.png").write_bytes(b"")
+    (given / "scene.blend").write_bytes(b"")
+    for path in (f"{given}/", f"{given}/untitled", f"{given}/a.png", f"{given}/scene.blend", f"{given}/gone.blend"):
         bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=path)
         assert str(given) in submitted[-1].command
+    (given / "coco.json").write_text("{}")
+    bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=f"{given}/coco.json")
+    assert f"{given}/coco.json" in submitted[-1].command
     with pytest.raises(RuntimeError, match="does not exist"):
         bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(tmp_path / "gone" / "a.json"))
 

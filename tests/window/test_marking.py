@@ -20,6 +20,7 @@ from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
 from bl_ext.user_default.objectgs.objectgs_addon.picking import marks
 """
 VASE, MONKEY, TABLE = 8, 6, 9
+TOOL = "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT', create=False).idname"
 """IDs in the demo capture."""
 
 
@@ -108,8 +109,7 @@ def test_marking_is_the_step_after_a_training_without_masks(window):
     assert next_step(window) == "objectgs.start_marking"
     window.run(script("result = call(bpy.ops.objectgs.start_marking)"))
     assert settled(window) == {0: asked(window, "len(pointing._session.keys)")}
-    tool = "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT', create=False).idname"
-    assert asked(window, tool) == "objectgs.mark"
+    assert asked(window, TOOL) == "objectgs.mark"
     assert asked(window, "[item.name for item in root.objectgs.marked]") == ["Object 1"]
 
 
@@ -173,6 +173,7 @@ def test_marked_objects_get_collections_of_their_own(window, centers):
     wait(window, f"len(root.objectgs.objects) == 2 and {IDLE}", 240)
     names = window.run(script("result = [[item.name, item.splats] for item in root.objectgs.objects]"))
     assert [name for name, _ in names] == ["Vase", "Object 2"] and all(splats > 20 for _, splats in names)
+    assert asked(window, TOOL) == "builtin.select_box", "a click selects an object now, and draws no stroke"
     assert not asked(window, "pointing.is_active(root)")
     collections = window.run(script("result = sorted(scene.object_collections(root))"))
     assert {1, 2} <= set(collections)

@@ -72,8 +72,8 @@ def read_capture_model(folder: Path) -> Model:
     if photos:
         raise InputError(
             f"{folder} contains {len(photos)} photos, but not where they were taken; compute that with Import "
-            "Photos, on the command line `sfm`, or save the cameras of COLMAP, RealityScan or Metashape there, for "
-            f"instance COLMAP's model in {folder / 'sparse' / '0'}."
+            "Photos or Video (on the command line: `sfm`), or save the cameras of COLMAP, RealityScan or Metashape "
+            f"there, for instance COLMAP's model in {folder / 'sparse' / '0'}."
         )
     raise InputError(
         f"{folder} contains no COLMAP model: expected cameras, images and points3D (.bin or .txt) in "

@@ -15,6 +15,9 @@ from ...state import folder_trust
 from ...state.next_step import can_mark
 from ..tab import WithReconstruction, draw_job_of
 
+_ROWS = 3
+"""Rows of the state of the marking, whatever it says."""
+
 
 class MarkedList(bpy.types.UIList):
     """Rows of `MarkedObject`."""
@@ -97,7 +100,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         progress, waits = pointing.state()
         if progress < 1.0:
             layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
-            write(layout, pointing.message())
+            write(layout, pointing.message(), rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
         if waits:
@@ -108,7 +111,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             text = "Press Tab for the next object. Ctrl and a stroke take away what does not belong to any."
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
-        write(layout, text, "INFO")
+        write(layout, text, "INFO", rows=_ROWS)
 
 
 def _draw_suggesting(layout: bpy.types.UILayout, properties: Any) -> None:
