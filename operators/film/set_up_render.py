@@ -2,6 +2,7 @@
 """Set up the scene to render splats in their captured colors."""
 
 import bpy
+import gpu
 
 from ...objectgs_addon import scene
 from ..common import need
@@ -27,10 +28,10 @@ class SetUpRender(bpy.types.Operator):
         camera = scene.set_up_render(context.scene, need.active_root(context), chosen)
         render = context.scene.render
         size = f", with the resolution of {camera.name}" if camera is not None else ""
-        self.report(
-            {"INFO"},
-            f"{context.scene.name} renders captured colors at {render.resolution_x} x {render.resolution_y}{size}",
-        )
+        text = f"{context.scene.name} renders captured colors at {render.resolution_x} x {render.resolution_y}{size}"
+        if not bpy.app.background and gpu.platform.device_type_get() == "SOFTWARE":
+            text += "; without a graphics card this takes many minutes, and Render Film Frames is faster"
+        self.report({"INFO"}, text)
         return {"FINISHED"}
 
 

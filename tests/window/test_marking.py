@@ -20,8 +20,8 @@ from bl_ext.user_default.objectgs.objectgs_addon.running import pointing
 from bl_ext.user_default.objectgs.objectgs_addon.picking import marks
 """
 VASE, MONKEY, TABLE = 8, 6, 9
-TOOL = "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT', create=False).idname"
 """IDs in the demo capture."""
+TOOL = "bpy.context.workspace.tools.from_space_view3d_mode('OBJECT', create=False).idname"
 
 
 @pytest.fixture(scope="module")
