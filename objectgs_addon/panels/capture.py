@@ -19,6 +19,8 @@ from ..state.next_step import IMPORT, RESUME, Step, find_step, is_capture_gone, 
 from .preferences import draw_online_access
 from .tab import Tab, draw_job
 
+_KINDS = ("sfm", "import", "import-splats", "demo", "setup")
+"""Kinds of jobs that are begun by the buttons of this panel; others say in their own panels what they do."""
 _BOX = 45.0
 """Width in pixels of a box's borders and a button beside its text, at a UI scale of 1."""
 
@@ -52,10 +54,7 @@ class CapturePanel(Tab, bpy.types.Panel):
             (index, job)
             for index, job in enumerate(background.queue.jobs)
             if not job.is_finished
-            and (
-                job.kind in ("sfm", "import", "import-splats", "demo", "setup")
-                or (active is not None and job.folder == scene.folder_of(active))
-            )
+            and (job.kind in _KINDS or (active is not None and job.folder == scene.folder_of(active)))
         ]
         if active is not None:
             row = layout.row(align=True)
@@ -118,7 +117,7 @@ def _step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | N
 
 def _draw_jobs(layout: bpy.types.UILayout, jobs: list[tuple[int, Job]]) -> None:
     for index, job in jobs:
-        draw_job(layout, job, index)
+        draw_job(layout, job, index, job.kind not in _KINDS)
 
 
 def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int, Job]], is_busy: bool) -> None:

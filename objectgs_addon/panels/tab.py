@@ -50,10 +50,10 @@ def draw_job_of(layout: bpy.types.UILayout, job: Job) -> None:
         draw_job(layout, job, background.queue.jobs.index(job))
 
 
-def draw_job(layout: bpy.types.UILayout, job: Job, index: int) -> None:
-    """Draw a job of the queue in a box."""
+def draw_job(layout: bpy.types.UILayout, job: Job, index: int, brief: bool = False) -> None:
+    """Draw a job of the queue in a box; brief: where another panel says what it does."""
     box = layout.box()
     if job.is_finished:
         draw_over(box, job)
     else:
-        draw_running(box, job, index)
+        draw_running(box, job, index, brief)

@@ -39,8 +39,8 @@ def summary(job: Job) -> str:
     return f"{job.title}: {job.stage or job.message}, {100 * job.progress:.0f} %{left}"
 
 
-def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
-    """Draw the progress, buttons and figures of an unfinished job."""
+def draw_running(layout: bpy.types.UILayout, job: Job, index: int, brief: bool = False) -> None:
+    """Draw the progress and buttons of an unfinished job, with what it does, or if `brief`, with its title alone."""
     row = layout.row(align=True)
     if job.state is State.WAITING:
         row.label(text=summary(job), icon="TIME")
@@ -55,7 +55,7 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int) -> None:
     if job.state is not State.STOPPING:
         row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
-        write(layout, f"{job.title}: {activity(job)}")
+        write(layout, job.title if brief else f"{job.title}: {activity(job)}")
 
 
 def activity(job: Job) -> str:

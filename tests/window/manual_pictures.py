@@ -168,7 +168,7 @@ def help_popover(window: Window) -> None:
     """Save the help that the question mark opens."""
     left, top, right, _ = window.region("UI")
     window.blender.click(right - 78, top + 15)
-    window.save("help", (left, top, SIZE[0], top + 290), mouse=True)
+    window.save("help", (left, top, SIZE[0], top + 340), mouse=True)
     window.blender.key("Escape")
 
 
