@@ -54,7 +54,7 @@ class CapturePanel(Tab, bpy.types.Panel):
             (index, job)
             for index, job in enumerate(background.queue.jobs)
             if not job.is_finished
-            and (job.kind in _KINDS or (active is not None and job.folder == scene.folder_of(active)))
+            and (job.kind in _KINDS or (active is not None and _is_long(job, scene.folder_of(active))))
         ]
         if active is not None:
             row = layout.row(align=True)
@@ -113,6 +113,11 @@ def _step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step | N
     if job is not None and job.kind == "train" and job.state is State.STOPPED and folder_trust.state_of(root).steps:
         return RESUME
     return step
+
+
+def _is_long(job: Job, folder: Path) -> bool:
+    """Return whether a job on a reconstruction's folder takes longer than what follows an edit, which takes seconds."""
+    return job.folder == folder and job.kind != "fill"
 
 
 def _draw_jobs(layout: bpy.types.UILayout, jobs: list[tuple[int, Job]]) -> None:

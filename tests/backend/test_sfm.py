@@ -25,6 +25,7 @@ from backend.sfm.model import centers_of
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.shared.formats import photos_source
 
+from .command_result import assert_rejected
 from .rendered_photos import HEIGHT, VIEWS, WIDTH, photo, pose, pose_errors, ring, write_photos
 
 
@@ -190,8 +191,10 @@ def test_weak_photos_are_named_and_left_out_by_request(photos, tmp_path, run_com
     rotation = Rotation.from_rotvec([0.3, 1.0, -2.0]).as_matrix()
     moved.transform(pycolmap.Sim3d(np.column_stack([5 * rotation, [1.0, 20.0, 3.0]])))
     moved.write(capture / "sparse" / "0")
+    shutil.rmtree(folder)
+    assert_rejected(run_command("sfm", tmp_path / "other", "--out", capture), "other does not exist")
     result = run_command("sfm", folder, "--out", capture, "--leave-out", "photo 3b.png")
-    assert result.code == EXIT_DONE
+    assert result.code == EXIT_DONE and "its copies in" in result.err + result.out
     report = json.loads((capture / "sfm" / "sfm.json").read_text())
     assert report["left_out"] == {"photo 3b.png": "it was left out by request"} and not report["weak"]
     assert report["registered"] == VIEWS and report["photos"] == VIEWS + 1

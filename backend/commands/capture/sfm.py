@@ -28,7 +28,15 @@ from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import make_folder, recorded
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, write_source
+from ...shared.formats.photos_source import (
+    PHOTOS,
+    REPORT,
+    VIDEOS,
+    WORK,
+    PhotosSource,
+    read_source,
+    write_source,
+)
 from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
@@ -51,7 +59,8 @@ _WORST = 10
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
     sources, capture = options.photos, options.out.absolute()  # COLMAP's processes run in another folder.
-    if are_copied(sources, capture):
+    before = read_source(capture)
+    if before is not None and before.photos == [path.resolve() for path in sources] and are_copied(sources, capture):
         reporter.warning(f"{_missing(sources)} does not exist any more, so its copies in {capture / IMAGES} are used.")
     else:
         _require_sources(sources)
