@@ -43,8 +43,8 @@ def former_poses(capture: Path) -> dict[str, Pose]:
 def similarity(now: Mapping[str, Pose], then: Mapping[str, Pose]) -> np.ndarray | None:
     """Find the similarity transform that places cameras as they were.
 
-    The rotation is the mean of those of the cameras, and scale and translation are medians, so that single photos
-    whose pose was wrong do not matter.
+    The rotation is the mean of those of the cameras, with less weight for those far from it, and scale and translation
+    are medians, so that single photos whose pose was wrong do not matter.
 
     Args:
         now, then: the poses by name of the photo.

@@ -7,6 +7,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.photos_source import IMAGES
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
@@ -16,7 +17,7 @@ from ..common.import_dialog import ImportDialog
 from ..common.reporting import reports_errors
 
 _FILES = ("*.json", "*.xml")
-_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".exr", ".npy", ".npz")
+_IMAGES = (*sorted(IMAGES), ".exr", ".npy", ".npz")
 """Suffixes of masks, of which one stands for the whole folder."""
 
 

@@ -28,15 +28,7 @@ from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import make_folder, recorded
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import (
-    PHOTOS,
-    REPORT,
-    VIDEOS,
-    WORK,
-    PhotosSource,
-    read_source,
-    write_source,
-)
+from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, read_source, write_source
 from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
@@ -89,6 +81,7 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 
 def _missing(sources: list[Path]) -> Path:
+    """Return the first source that does not exist."""
     return next(path for path in sources if not path.exists())
 
 
@@ -131,9 +124,10 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
     photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter)
-    source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
     if are_copied(made_from.photos, capture):
         source = images
+    else:
+        source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
     unwanted = {name: "it was left out by request" for name in made_from.leave_out}
     photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]
