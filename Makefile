@@ -47,7 +47,7 @@ help:
 	@echo "make zip            the extension to install in Blender, in build/"
 	@echo "make test           the tests, within ten minutes"
 	@echo "make test-long      the other tests of CI: each takes many seconds"
-	@echo "make test-slow      tests that take minutes, such as trainings in the simulator of a GPU"
+	@echo "make test-slow      tests that take minutes, such as those of the cache of kernels"
 	@echo "make test-window    the tests that drive a Blender with a window, where there is one"
 	@echo "make test-blenders  the tests of the Blender side in more versions of Blender"
 	@echo "make lint           what a change must pass beside the tests"

@@ -58,7 +58,7 @@ class Scene:
     """Random splats on the GPU, spread evenly over the image and over depths 1 to 4."""
 
     def __init__(self, count: int, width: int, height: int, objects: int = 8) -> None:
-        from backend.raster.cuda import renderer
+        from backend.raster.gpu import renderer
 
         self.renderer = renderer
         rng = np.random.default_rng(0)

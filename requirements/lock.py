@@ -3,12 +3,12 @@
 
     python requirements/lock.py
 
-Needs uv (`dev.txt`) and access to PyPI. Run it after each change of backend.txt, torch.txt or cuda.txt. A system that
-lacks a wheel of any package is refused. The files of a system:
+Needs uv (`dev.txt`) and access to PyPI. Run it after each change of backend.txt or torch.txt. A system that lacks a
+wheel of any package is refused. The files of a system:
 
     SYSTEM.txt       packages of every environment
     SYSTEM-cpu.txt   torch, where PyPI's build is the one for processors
-    SYSTEM-cuda.txt  packages for NVIDIA GPUs; with torch, where PyPI's build is the one for these
+    SYSTEM-cuda.txt  torch and its packages for NVIDIA GPUs, where PyPI's build is the one for these
 
 Other builds of torch are not on PyPI; Set Up Backend installs them by version.
 """
@@ -27,9 +27,9 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 LOCKED = HERE / "locked"
-SOURCES = ("backend.txt", "torch.txt", "cuda.txt")
+SOURCES = ("backend.txt", "torch.txt")
 PYTHONS = ("3.11", "3.12", "3.13")
-GPU_PACKAGE = re.compile(r"nvidia-|cuda-|numba-cuda$|triton$")
+GPU_PACKAGE = re.compile(r"nvidia-|cuda-|triton$")
 
 
 @dataclass(frozen=True)

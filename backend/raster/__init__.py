@@ -1,4 +1,4 @@
-"""Differentiable rasterization of 3D Gaussians and discs: a common interface to the CPU and CUDA renderers."""
+"""Differentiable rasterization of 3D Gaussians and discs: a common interface to the CPU and GPU renderers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import config
 
 from .camera import Camera
 from .cpu import renderer as cpu
+from .devices import emulated
 
 __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "object_ranks", "rasterize"]
 
@@ -42,11 +42,11 @@ class Rendered(NamedTuple):
 
 
 def _renderer(device: torch.device) -> Any:
-    """Return the renderer module for tensors on `device`; in numba's simulator, always the CUDA renderer."""
-    if device.type == "cuda" or config.ENABLE_CUDASIM:
-        from .cuda import renderer as cuda
+    """Return the renderer module for tensors on `device`; if a GPU is emulated, always the GPU renderer."""
+    if device.type == "cuda" or emulated():
+        from .gpu import renderer as gpu
 
-        return cuda
+        return gpu
     return cpu
 
 
@@ -130,7 +130,7 @@ def rasterize(
 ) -> Rendered:
     """Render 3D Gaussians (Kerbl et al. 2023) or discs (Huang et al. 2024), differentiable in the first five arguments.
 
-    Only the requested planes are computed. Tensors on a CUDA device are rendered by the CUDA renderer, and all results
+    Only the requested planes are computed. Tensors on a GPU are rendered by the GPU renderer, and all results
     are on that device, including the frame's `seen` and `screen_gradient`.
 
     Args:
@@ -181,7 +181,7 @@ def object_map(rendered: Rendered) -> tuple[Any, Any]:
 
     Returns:
         The ID (H, W) int32, -1 where nothing is drawn, and its probability (H, W) float32: the sum of the blending
-        weights of its splats. NumPy arrays from the CPU renderer, tensors on the device from the CUDA renderer.
+        weights of its splats. NumPy arrays from the CPU renderer, tensors on the device from the GPU renderer.
     """
     ids, probabilities = object_ranks(rendered, 1)
     return ids[0], probabilities[0]
@@ -200,9 +200,9 @@ def object_ranks(rendered: Rendered, ranks: int) -> tuple[Any, Any]:
     """
     if isinstance(rendered.frame, cpu.Frame):
         return cpu.object_ranks(rendered.frame, ranks)
-    from .cuda import renderer as cuda
+    from .gpu import renderer as gpu
 
-    return cuda.object_ranks(rendered.frame, ranks)
+    return gpu.object_ranks(rendered.frame, ranks)
 
 
 _SURFACE = {"want_depth": True, "want_normals": True, "want_distortion": True}

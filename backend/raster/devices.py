@@ -1,18 +1,16 @@
 """Selection of the compute device, the CPU or an NVIDIA GPU through CUDA, and diagnosis if CUDA is not available.
 
-Functions with an implementation for each device call `on_gpu` with one of their tensors. In numba's simulator
-(NUMBA_ENABLE_CUDASIM=1), tensors stay in host memory, and the GPU implementations are used.
+Functions with an implementation for each device call `on_gpu` with one of their tensors. If a GPU is emulated
+(OBJECTGS_EMULATE_GPU=1), tensors stay in host memory, and the GPU implementations are used.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib.util
-from typing import Any
+import os
 
 import numpy as np
 import torch
-from numba import config
 
 from ..shared.errors import InputError
 
@@ -22,7 +20,7 @@ MIN_FREE_MEMORY = 1e9
 """Bytes of GPU memory that must be free; CUDA itself and torch's libraries use about half of them."""
 
 _OUT_OF_MEMORY_TEXTS = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
-"""Error texts of numba's driver, the CUDA runtime and cuBLAS."""
+"""Error texts of the driver, the CUDA runtime and cuBLAS."""
 
 CPU = torch.device("cpu")
 
@@ -34,7 +32,7 @@ def pick(requested: str) -> torch.device:
         requested: "cpu", "cuda", or "auto" (CUDA if available, otherwise the CPU).
 
     Returns:
-        The torch device; in numba's simulator, always the CPU.
+        The torch device; if a GPU is emulated, always the CPU.
 
     Raises:
         InputError: `requested` is "cuda" and CUDA is not available.
@@ -45,24 +43,26 @@ def pick(requested: str) -> torch.device:
     why_not = None if requested == "cpu" else why_not_cuda()
     if requested == "cuda" and why_not is not None:
         raise InputError(why_not)
-    if requested == "cpu" or why_not is not None or simulated():
+    if requested == "cpu" or why_not is not None or emulated():
         return CPU
     return torch.device("cuda", torch.cuda.current_device())
 
 
-def simulated() -> bool:
-    """Return whether numba runs CUDA kernels in its simulator."""
-    return bool(config.ENABLE_CUDASIM)
+def emulated() -> bool:
+    """Return whether a GPU is emulated on the CPU, for tests."""
+    return os.environ.get("OBJECTGS_EMULATE_GPU") == "1"
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
-    """Return whether a tensor is processed by torch and CUDA kernels instead of numba's kernels on arrays."""
-    return tensor.is_cuda or simulated()
+    """Return whether a tensor is processed by torch and GPU kernels instead of numba's kernels on arrays."""
+    return tensor.is_cuda or emulated()
 
 
 def name_of(device: torch.device) -> str:
-    """Return the display name of a device: "cpu", or "cuda" with the GPU's name."""
-    return f"cuda ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else "cpu"
+    """Return the display name of a device: "cpu", or "cuda" or "hip" (of AMD) with the GPU's name."""
+    if device.type != "cuda":
+        return device.type
+    return f"{'hip' if torch.version.hip else 'cuda'} ({torch.cuda.get_device_name(device)})"
 
 
 def host(values: torch.Tensor | np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def upload(values: np.ndarray, like: torch.Tensor | torch.device) -> torch.Tenso
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error of torch or numba means that the GPU's memory is full."""
+    """Return whether an error of torch or of a kernel means that the GPU's memory is full."""
     return isinstance(error, torch.cuda.OutOfMemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY_TEXTS)
 
 
@@ -103,21 +103,17 @@ def why_not_cuda() -> str | None:
     Returns:
         One sentence with the reason and a remedy; None if CUDA works.
     """
-    if simulated():
+    if emulated():
         return None
     return _problem_with_build() or _problem_with_driver() or _problem_with_gpu() or _problem_with_kernels()
 
 
 def _problem_with_build() -> str | None:
-    if getattr(torch.version, "hip", None):
-        return "This PyTorch is built for AMD GPUs, which ObjectGS cannot use; install a build for CUDA."
-    if torch.version.cuda is None:
+    if torch.version.cuda is None and getattr(torch.version, "hip", None) is None:
         return (
             f"This PyTorch ({torch.__version__}) is built without CUDA; set the backend up again for an NVIDIA GPU, or "
             "install a build of PyTorch for CUDA."
         )
-    if importlib.util.find_spec("numba_cuda") is None:
-        return "The package numba-cuda is missing; install it with pip install -r requirements/cuda.txt."
     return None
 
 
@@ -177,22 +173,17 @@ def explain_low_memory(name: str, free: float, total: float) -> str | None:
 
 
 def _problem_with_kernels() -> str | None:
-    """Compile and run a minimal kernel, since the driver must also support numba-cuda's separate CUDA toolkit."""
+    """Compile and run a small kernel, since torch has the compiler of kernels in a library of its own."""
     try:
-        from numba import cuda
+        from .gpu.kernel import kernel
+        from .splats import SPLAT_COLUMNS
 
-        @cuda.jit
-        def mark(out: Any) -> None:
-            out[0] = 1
-
-        out = torch.zeros(1, dtype=torch.int32, device="cuda")
-        mark[1, 1](cuda.as_cuda_array(out))
-        cuda.synchronize()
-        if int(out[0]) != 1:
-            return "A CUDA kernel ran without effect; restart the computer."
+        unseen = torch.full((1, SPLAT_COLUMNS), -1.0, device="cuda")
+        keys = torch.zeros(1, dtype=torch.int64, device="cuda")
+        kernel("write_keys").for_each(1, unseen, 1, keys)
+        if int(keys[0]) != 2**63 - 1:
+            return "A kernel ran on the GPU without effect; restart the computer."
     except Exception as error:  # For any error, the CPU can be used instead.
         first = f"{type(error).__name__}: {str(error).strip()}".partition("\n")[0].rstrip(".: ")
-        if "PTX" in str(error) and "version" in str(error).lower():
-            return "The NVIDIA driver is too old for the installed numba-cuda; install a newer driver from nvidia.com."
-        return f"numba-cuda cannot run a kernel here ({first}); install it with pip install -r requirements/cuda.txt."
+        return f"Kernels do not run on this GPU ({first}); install a newer driver, or set the backend up again."
     return None

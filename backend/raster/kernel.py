@@ -99,7 +99,7 @@ class _Locked:
 
 @functools.cache
 def locked(kind: Any) -> Any:
-    """Return a class of cache files, of numba or of numba-cuda, whose variants processes may save at the same time."""
+    """Return a class of numba's cache files whose variants processes may save at the same time."""
     return type("LockedCacheFile", (_Locked, kind), {})
 
 

@@ -49,7 +49,7 @@ MQ, MQX, MQY, MSX, MSY = range(10, 15)
 G_NORMAL = 16
 GRADIENT_COLUMNS = 16  # Padded to one cache line, which is written as one vector.
 
-_MAX_COLOR = 3e38  # Within the range of float32.
+MAX_COLOR = 3e38  # Within the range of float32.
 
 _HALF_LOG2E = 0.5 / math.log(2.0)
 _LN2 = math.log(2.0)
@@ -228,7 +228,7 @@ def project_splat(
         value = 0.5
         for k in range(count):
             value += basis[k] * sh[n, k, channel]
-        finite = finite and abs(value) < _MAX_COLOR
+        finite = finite and abs(value) < MAX_COLOR
         splats[n, RED + channel] = max(value, 0.0)
     if not finite:
         return

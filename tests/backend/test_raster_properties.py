@@ -5,25 +5,23 @@ import dataclasses
 import itertools
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from backend.raster.reference import rasterize_reference
 from backend.raster.settings import NEAR
-from tests.backend.test_raster import NAMES, PRIMITIVES, SIMULATED, camera, rasterize
+from tests.backend.test_raster import NAMES, PRIMITIVES, camera, rasterize
 
 OBJECTS = 3
 C0 = 0.28209479177387814
-CAMERA = camera(9, 7) if SIMULATED else camera(23, 17)
+CAMERA = camera(23, 17)
 LABELS = torch.arange(CAMERA.height * CAMERA.width, dtype=torch.int32).reshape(CAMERA.height, CAMERA.width) % OBJECTS
 
 anything = settings(
-    max_examples=4 if SIMULATED else 40, deadline=None, derandomize=True, database=None,
+    max_examples=40, deadline=None, derandomize=True, database=None,
     phases=(Phase.generate, Phase.shrink),
 )  # fmt: skip
-cpu_only = pytest.mark.skipif(SIMULATED, reason="CPU and CUDA share this code")
 
 
 def powers(low, high):
@@ -168,7 +166,6 @@ def test_result_is_independent_of_input_order(primitive, scene, seed):
             assert np.array_equal(again[name], want), name
 
 
-@cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes(), power=st.integers(-20, 20))
@@ -183,7 +180,6 @@ def test_result_is_independent_of_length_unit(primitive, scene, power):
     assert np.array_equal(there["depth"], here["depth"] * unit)
 
 
-@cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes(), place=st.tuples(*3 * [st.floats(-1e6, 1e6)]))
@@ -200,7 +196,6 @@ def test_result_is_independent_of_world_offset(primitive, scene, place):
         assert np.array_equal(there[name], here[name]), name
 
 
-@cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes(), data=st.data())
@@ -217,7 +212,6 @@ def test_images_are_linear_in_colors(primitive, scene, data):
     np.testing.assert_allclose(total, render(one)["color"] + 2 * render(other)["color"], atol=1e-5)
 
 
-@cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes())
@@ -229,7 +223,6 @@ def test_weights_plus_transmittance_sum_to_one(primitive, scene):
         np.testing.assert_allclose(plane, found["alpha"], atol=2e-6)
 
 
-@cpu_only
 @PRIMITIVES
 @anything
 @given(scene=scenes(), left=st.integers(0, 20), top=st.integers(0, 14), data=st.data())

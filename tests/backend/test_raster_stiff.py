@@ -10,28 +10,21 @@ import torch
 from backend.raster import Camera
 from backend.raster.cpu import renderer as cpu
 from backend.raster.reference import rasterize_reference
-from backend.raster.settings import ALPHA_MIN, NEAR
-from tests.backend import test_raster
+from backend.raster.settings import ALPHA_MAX, ALPHA_MIN, NEAR
 from tests.backend.test_raster import (
+    EMULATED,
     FOCAL,
     HEIGHT,
     NAMES,
-    SIMULATED,
+    WIDTH,
     as_float32,
+    camera,
     compare,
-    fewer,
     mapped,
     random_scene,
     ranked,
     rasterize,
 )
-
-# In the simulator, which takes a thread for each pixel, images have one tile: the scenes are stiff in their projection.
-WIDTH = 15 if SIMULATED else test_raster.WIDTH
-
-
-def camera(width=WIDTH, height=HEIGHT):
-    return test_raster.camera(width, height)
 
 
 def straight(width=WIDTH, height=HEIGHT, focal=FOCAL, **kwargs):
@@ -61,7 +54,7 @@ def join(*scenes):
     return {k: torch.cat([s[k] for s in scenes]) for k in scenes[0]}
 
 
-OTHERS = 10 if SIMULATED else 25
+OTHERS = 25
 
 
 def among_others(scene, seed=0):
@@ -151,20 +144,19 @@ def test_scales_whose_determinant_underflows_float32(primitive):
     compare(among_others(one(scale=(1e-30, 0.3, 1e-30), quat=(0.9, 0.3, 0.2, 0.4))), camera(), primitive=primitive)
 
 
-@pytest.mark.parametrize("ratio", fewer([1e3, 1e4, 1e5, 1e6], [0, 3]))
-@pytest.mark.parametrize("angle", fewer([0.0, 90.0, 45.0, 30.0, 89.999], [2, 4]))
+@pytest.mark.parametrize("ratio", [1e3, 1e4, 1e5, 1e6])
+@pytest.mark.parametrize("angle", [0.0, 90.0, 45.0, 30.0, 89.999])
 @pytest.mark.parametrize("thin", [1e-6, 1e-3])
 def test_needle(ratio, angle, thin, primitive):
     if primitive == "2d" and thin > 1e-6:
         thin *= 10  # wide enough for its plane to be drawn
     half = np.deg2rad(angle) / 2
     needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
-    if not SIMULATED:
-        compare(needle, camera(), primitive=primitive)
+    compare(needle, camera(), primitive=primitive)
     compare(among_others(needle), camera(), primitive=primitive)
 
 
-@pytest.mark.parametrize("seed", fewer(range(5), [0, 1]))
+@pytest.mark.parametrize("seed", range(5))
 def test_needles_in_random_directions(seed, primitive):
     rng = np.random.default_rng(seed)
     scene = random_scene(seed, count=20)
@@ -193,7 +185,7 @@ def test_splat_outside_image_has_no_gradient(primitive):
     assert_dropped_without_effect(one(mean=(50.0, 0, 2.0)), primitive=primitive)
 
 
-@pytest.mark.parametrize("scale", fewer([np.inf, 3e38, 1e20, 1e9], [0, 2]))
+@pytest.mark.parametrize("scale", [np.inf, 3e38, 1e20, 1e9])
 def test_overflowing_scale(scale, primitive):
     """The exponential of a diverged log scale."""
     for scales in ((scale, 0.1, 0.1), (0.1, scale, 0.1), (scale, scale, scale)):
@@ -209,8 +201,8 @@ def test_opaque_splat_on_a_pixel_center_is_drawn(primitive):
         assert got.alpha[HEIGHT // 2, WIDTH // 2].item() == pytest.approx(0.99)
 
 
-@pytest.mark.parametrize("scale", fewer([1e-4, 0.1, 1.0], [0, 2]))
-@pytest.mark.parametrize("opacity", fewer([0.98, 0.99, 1.0], [0, 2]))
+@pytest.mark.parametrize("scale", [1e-4, 0.1, 1.0])
+@pytest.mark.parametrize("opacity", [0.98, ALPHA_MAX - 1e-4, ALPHA_MAX + 1e-4, 1.0])
 def test_sixteen_opaque_splats_stacked(scale, opacity, primitive):
     layers = [one(mean=(0, 0, 1 + 0.1 * i), opacity=opacity, scale=(scale,) * 3, id=i % 5) for i in range(16)]
     compare(join(*layers), straight(), gradient_tolerance=BEHIND_OPAQUE, primitive=primitive)
@@ -279,7 +271,7 @@ def test_coincident_points(primitive):
 
 @pytest.mark.parametrize("same", ["depth", "everything but the id"])
 def test_equal_depths_are_independent_of_input_order(same, primitive):
-    count = 30 if SIMULATED else 80
+    count = 80
     scene = as_float32(random_scene(3, count=count))
     if same == "depth":
         scene["means"][:, 2] = 2.0
@@ -288,7 +280,7 @@ def test_equal_depths_are_independent_of_input_order(same, primitive):
     labels = torch.tensor(np.random.default_rng(0).integers(0, 5, (HEIGHT, WIDTH)), dtype=torch.int32)
     cam = camera()
     first = draw(scene, cam, labels, primitive=primitive)
-    for seed in range(1 if SIMULATED else 3):
+    for seed in range(3):
         mixed = torch.tensor(np.random.default_rng(seed).permutation(count))
         again = draw({k: v[mixed] for k, v in scene.items()}, cam, labels, primitive=primitive)
         if same == "depth":
@@ -302,7 +294,7 @@ def test_equal_depths_are_independent_of_input_order(same, primitive):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("value", fewer([np.nan, np.inf, -np.inf], [0, 1]))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_nonfinite_splat_is_dropped(name, value, primitive):
     bad = one()
     bad[name].view(-1)[0] = value
@@ -367,10 +359,10 @@ def dense_probabilities(scene, cam, values, primitive="3d"):
     return np.stack(planes, -1)
 
 
-@pytest.mark.parametrize("seed", fewer(range(4), [0]))
+@pytest.mark.parametrize("seed", range(4))
 def test_object_map_matches_dense_probabilities(seed, primitive):
     rng = np.random.default_rng(seed)
-    count, objects, cam = (80, 8, camera()) if SIMULATED else (300, 40, camera(150, 71))
+    count, objects, cam = 300, 40, camera(150, 71)
     scene = as_float32(random_scene(seed, count=count))
     values = np.unique(rng.integers(-(2**31), 2**31, objects)).astype(np.int32)
     scene["ids"] = torch.tensor(rng.choice(values, count))
@@ -385,7 +377,7 @@ def test_object_map_matches_dense_probabilities(seed, primitive):
 
 def test_object_map_resolves_ties_to_smallest_id():
     """Two objects with equal probability, in both orders of input."""
-    cam = straight() if SIMULATED else straight(65, 33)
+    cam = straight(65, 33)
     left, right = (one(mean=(x, 0, 2.0), scale=(0.5, 0.5, 0.1), opacity=0.2) for x in (-0.1, 0.1))
     for a, b in ((70_000, 9), (9, 70_000)):
         left["ids"][0], right["ids"][0] = a, b
@@ -401,17 +393,19 @@ def test_object_map_resolves_ties_to_smallest_id():
         ids, probabilities = ranked(rasterize(**as_float32(join(left, right)), camera=cam), 2)
         equal = dense[..., 0] == dense[..., 1]
         assert (ids[0] == expected).all() and (ids[1] != expected)[both].all()
-        assert (ids[:, both & equal] == [[9], [70_000]]).all() and ((both & equal).any() or SIMULATED)
+        assert (ids[:, both & equal] == [[9], [70_000]]).all() and (both & equal).any()
         assert np.array_equal(probabilities.sum(0)[both], dense.sum(-1)[both])
 
 
-def test_many_objects_and_large_ids(primitive):
-    """In the simulator, 200 objects: more per pixel than the GPU sums up at once."""
-    rng = np.random.default_rng(0)
-    objects, count, size, cam = (200, 240, 0.2, camera()) if SIMULATED else (10_000, 12_000, 0.02, camera(97, 71))
+@pytest.mark.parametrize(
+    ("objects", "count", "size", "faint", "cam"),
+    [(10_000, 12_000, 0.02, 1.0, (97, 71)), (200, 240, 0.2, 0.1, (WIDTH, HEIGHT))],
+)
+def test_many_objects_and_large_ids(objects, count, size, faint, cam, primitive):
+    """With 200 faint objects, there are more per pixel than the GPU sums up at once."""
+    rng, cam = np.random.default_rng(0), camera(*cam)
     scene = as_float32(random_scene(0, count=count, size=size))
-    if SIMULATED:
-        scene["opacities"] *= 0.1
+    scene["opacities"] *= faint
     names = rng.choice(2**31 - 1, objects, replace=False).astype(np.int32)
     assert (names > 65_535).mean() > 0.99
     which = np.concatenate([np.arange(objects), rng.integers(0, objects, count - objects)])
@@ -432,10 +426,10 @@ def test_many_objects_and_large_ids(primitive):
 # Sizes and coordinates
 
 
-SIZES = [(1, 1), (1, 40), (67, 1), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)]
+SIZES = [(1, 1), (1, 40), (67, 1), (15, 15), (16, 16), (17, 33), (63, 31), (64, 32), (65, 33), (129, 65), (127, 3)]
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 18), (15, 15), (16, 16), (17, 33)] if SIMULATED else SIZES)
+@pytest.mark.parametrize("size", SIZES)
 def test_unusual_image_sizes(size, primitive):
     compare(random_scene(0, count=40), camera(*size), gradient_tolerance=2e-5, primitive=primitive)
 
@@ -471,8 +465,6 @@ def test_scene_of_another_size(size, primitive):
 
 
 def dense_scene():
-    if SIMULATED:
-        return as_float32(random_scene(5, count=60)), camera()
     return as_float32(random_scene(5, count=3000, size=0.05)), camera(200, 133)
 
 
@@ -482,7 +474,7 @@ def test_same_input_gives_identical_bits(primitive):
     assert_same_bits(draw(scene, cam, labels, primitive=primitive), draw(scene, cam, labels, primitive=primitive))
 
 
-@pytest.mark.skipif(SIMULATED or numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
+@pytest.mark.skipif(EMULATED or numba.config.NUMBA_NUM_THREADS < 2, reason="one thread only")
 def test_thread_count_does_not_change_bits(primitive):
     scene, cam = dense_scene()
     labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
@@ -513,7 +505,7 @@ def render_all_planes(scene, cam):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("turn", fewer([1e-6, 1e-4, 1e-3, 1e-2, 0.1], [0, 2, 4]))
+@pytest.mark.parametrize("turn", [1e-6, 1e-4, 1e-3, 1e-2, 0.1])
 def test_disc_seen_almost_edge_on(turn):
     # Not at a pixel center, where plane and spot are equal and gradients depend on only one of them.
     for mean in ((0.003, 0.002, 2.0), (0.011, -0.023, 2.0), (0.403, 0.001, 2.0)):
@@ -532,7 +524,7 @@ def test_disc_seen_exactly_edge_on():
     assert draw(as_float32(tilted(np.pi / 2)), straight(), primitive="2d")["plane 1"].max() > 0.5
 
 
-@pytest.mark.parametrize("turn", fewer([0.0, 1e-6, 1e-3, 0.1], [0, 2]))
+@pytest.mark.parametrize("turn", [0.0, 1e-6, 1e-3, 0.1])
 def test_disc_plane_through_camera(turn):
     """The distance along the ray to the plane is zero or nearly zero in some or all pixels."""
     lying = (np.cos(np.pi / 4 + turn), np.sin(np.pi / 4 + turn), 0, 0)
@@ -600,7 +592,7 @@ def test_screen_gradient_matches_moving_footprint():
     """Growth uses this gradient, so it must include the plane's part, not only the spot's."""
     scene = as_float32(tilted(0.7, scale=(6 / FOCAL, 8 / FOCAL, 1)))
     leaves = {k: v.requires_grad_(k != "ids") for k, v in scene.items()}
-    width = test_raster.WIDTH
+    width = WIDTH
     rendered = rasterize(**leaves, camera=straight(width), primitive="2d")
     pattern = torch.sin(torch.arange(width) / 5.0)[None, :].expand(HEIGHT, width)
     (rendered.alpha * pattern).sum().backward()
@@ -613,7 +605,7 @@ def test_screen_gradient_matches_moving_footprint():
 # The reference itself
 
 
-@pytest.mark.skipif(SIMULATED, reason="tests only the reference")
+@pytest.mark.skipif(EMULATED, reason="tests only the reference")
 @pytest.mark.parametrize(("primitive", "coefficients"), [("3d", 1), ("3d", 16), ("2d", 4)])
 @pytest.mark.long
 def test_reference_passes_gradcheck(primitive, coefficients):
@@ -643,4 +635,5 @@ def test_unused_planes_have_zero_gradient():
     )
     out = cpu.backward(frame, np.ones_like(frame.color), np.zeros_like(frame.transmittance))
     for name in NAMES:
-        np.testing.assert_allclose(getattr(out, name), scene[name].grad, rtol=1e-5, atol=1e-6)
+        found = scene[name].grad.numpy()
+        np.testing.assert_allclose(getattr(out, name), found, rtol=1e-5, atol=1e-6 * np.abs(found).max())

@@ -251,8 +251,10 @@ def test_system_without_locked_packages_is_rejected(root, monkeypatch):
     job = environment.set_up_job(sys.executable, root / "environment", "cpu")
     run(job)
     assert job.state is State.FAILED and "only for amiga-m68k; choose" in job.error
-    monkeypatch.setattr(layout, "system", lambda: "amiga-m68k")
-    (root / "requirements" / "locked" / "amiga-m68k-cuda.txt").unlink()
+    for name in ("", "-cpu"):
+        path = root / "requirements" / "locked" / f"amiga-m68k{name}.txt"
+        path.rename(path.with_name(f"macos-m68k{name}.txt"))
+    monkeypatch.setattr(layout, "system", lambda: "macos-m68k")
     with pytest.raises(events.Refused, match="choose the device CPU"):
         choice.check_system(root / "requirements", "cuda")
     choice.check_system(root / "requirements", "cpu")

@@ -79,12 +79,11 @@ def test_zip_has_expected_files_only(package):
     }
     assert {name for name in names if name.startswith("requirements/")} == {
         "requirements/backend.txt",
-        "requirements/cuda.txt",
         "requirements/models.txt",
         "requirements/torch.txt",
         *(f"requirements/locked/{path.name}" for path in (ROOT / "requirements" / "locked").iterdir()),
     }
-    assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ""}
+    assert {PurePosixPath(name).suffix for name in names} <= {".py", ".toml", ".txt", ".md", ".json", ".cu", ".h", ""}
 
 
 def test_versions_match():

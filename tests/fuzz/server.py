@@ -36,7 +36,7 @@ def main() -> None:
     import backend.cli.main
 
     for module in pkgutil.walk_packages(backend.__path__, "backend."):
-        if not module.name.endswith("__main__") and ".cuda" not in module.name:
+        if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     for line in sys.stdin:
         answers.write(json.dumps(_run(**json.loads(line))) + "\n")

@@ -1,4 +1,4 @@
-"""The CUDA renderer on a real GPU: the tests of all renderers, larger scenes against the CPU renderer, and tests that
+"""The GPU renderer on a real GPU: the tests of all renderers, larger scenes against the CPU renderer, and tests that
 require a GPU."""
 
 import gc
@@ -9,10 +9,7 @@ import torch
 
 from backend import raster
 from backend.raster import Camera
-from backend.raster.cuda import renderer
-from backend.raster.cuda.blending import blend_kernel
-from backend.raster.cuda.blending_backward import blend_backward_kernel
-from backend.raster.cuda.staging import Wanted
+from backend.raster.gpu import renderer
 from tests.backend import test_raster, test_raster_stiff
 from tests.backend.test_raster import *  # noqa: F403
 from tests.backend.test_raster import NAMES, as_float32, random_scene
@@ -133,20 +130,6 @@ def test_kernels_use_current_stream():
         got = raster.rasterize(**scene, camera=large_camera()).color
     stream.synchronize()
     assert torch.equal(got, expected)
-
-
-@KINDS
-def test_pixel_kernels_do_not_spill_registers(primitive):
-    step(as_float32(random_scene(3, count=100)), large_camera(64, 48), primitive, GPU)
-    flat = primitive == "2d"
-    wanted = Wanted(flat, True, True, True, flat, flat)
-    for kernel in (
-        blend_kernel(wanted),
-        blend_backward_kernel(wanted._replace(median=False)),
-    ):
-        assert kernel.overloads, "the tested kernel was not run"
-        assert max(kernel.get_local_mem_per_thread().values()) == 0
-        assert max(kernel.get_regs_per_thread().values()) <= 128
 
 
 def test_image_is_independent_of_object_count():

@@ -1,6 +1,6 @@
 """Training on a real GPU: quality as on the CPU, no synchronization, and checkpoints that resume on either device.
 
-Requires only packages such as torch, numba, numba-cuda, scipy, safetensors and Pillow, not those that read captures.
+Requires only packages such as torch, numba, scipy, safetensors and Pillow, not those that read captures.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ of its own tests it (see `self_test`). The outcome is kept beside the compiled k
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
+import ctypes
 import json
 import re
 import subprocess
@@ -19,6 +19,7 @@ from pathlib import Path
 import torch
 
 from ...raster import devices
+from ...raster.gpu.kernel import digest_of_sources
 from ...raster.kernel import digest_up_to
 from ...shared.errors import InputError
 from ...shared.events import Reporter
@@ -76,20 +77,19 @@ def _known_problem(device: torch.device) -> str | None:
 
 def _outcome(device: torch.device) -> Path:
     """Return the path of the outcome, which changes with all that the results depend on."""
-    versions = (torch.__version__, digest_up_to("training"), _driver())
+    versions = (torch.__version__, digest_up_to("training"), digest_of_sources(), _driver())
     return path_beside_kernels(".device.json", *versions, devices.name_of(device))
 
 
 def _driver() -> str:
-    """Return the versions of NVIDIA's driver and of numba-cuda, as far as they can be found out."""
-    found = []
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        found.append(importlib.metadata.version("numba-cuda"))
-    with contextlib.suppress(Exception):  # The package or the driver may be without it.
-        from cuda.core import system
-
-        found.append(str(system.get_kernel_mode_driver_version()))
-    return " ".join(found)
+    """Return the version of NVIDIA's driver, "" where it cannot be found out."""
+    with contextlib.suppress(OSError, AttributeError):
+        library = ctypes.CDLL("nvml.dll" if sys.platform == "win32" else "libnvidia-ml.so.1")
+        text = ctypes.create_string_buffer(80)
+        library.nvmlInit_v2()
+        if not library.nvmlSystemGetDriverVersion(text, len(text)):
+            return text.value.decode(errors="replace")
+    return ""
 
 
 def _test(reporter: Reporter) -> str:

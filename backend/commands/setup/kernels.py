@@ -44,7 +44,7 @@ def kernel_seconds(device: torch.device) -> float:
 
 
 def ensure_kernels(reporter: StoppingReporter, device: torch.device) -> None:
-    """Compile the kernels of a device, unless an earlier run did; the simulator needs no compilation.
+    """Compile the kernels of a device, unless an earlier run did; an emulated GPU needs no compilation.
 
     Args:
         reporter: Receives status and progress; may stop the compilation.
@@ -103,8 +103,8 @@ class _Steps(Reporter):
 
 
 def _are_ready(device: torch.device) -> bool:
-    """Return whether an earlier run compiled the kernels; the simulator needs no compilation."""
-    return devices.simulated() or _mark(device).exists()
+    """Return whether an earlier run compiled the kernels; an emulated GPU needs no compilation."""
+    return devices.emulated() or _mark(device).exists()
 
 
 def _mark(device: torch.device) -> Path:

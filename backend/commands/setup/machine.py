@@ -36,7 +36,7 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
     if device.type == "cuda":
         gpu = {
             "gpu_memory_gb": round(torch.cuda.get_device_properties(device).total_memory / 1e9, 1),
-            "cuda": torch.version.cuda, "numba-cuda": importlib.metadata.version("numba-cuda"),
+            "cuda": torch.version.hip or torch.version.cuda,
         }  # fmt: skip
     return {
         "objectgs": __version__,

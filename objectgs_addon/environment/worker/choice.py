@@ -52,7 +52,7 @@ def check_system(requirements: Path, device: str) -> None:
     version = platform.mac_ver()[0]
     if version and int(version.partition(".")[0]) < MACOS:
         raise Refused(f"The backend's packages need macOS {MACOS} or newer, and this is {version}; update macOS.")
-    if device == "cuda" and not (folder / f"{system}-cuda.txt").is_file():
+    if device == "cuda" and system.startswith("macos"):
         raise Refused(f"There are no packages for NVIDIA GPUs for {computer}; choose the device CPU.")
 
 

@@ -1,94 +1,114 @@
-"""Tests of the CUDA renderer alone; test_cuda.py runs them in numba's simulator."""
+"""Tests of the GPU renderer alone, on an emulated GPU; test_gpu_kernels.py runs them."""
 
 import itertools
+import shutil
 
 import numpy as np
 import pytest
 import torch
-from numba import cuda
 
 from backend.raster.cpu import renderer as cpu
-from backend.raster.cuda import binning as cuda_bin
-from backend.raster.cuda.blending import STAGED
-from backend.raster.cuda.kernel import any_in_warp, cuda_kernel, launch, launch_for_each, simulated
+from backend.raster.devices import emulated
+from backend.raster.gpu import binning
+from backend.raster.gpu import kernel as kernels
+from backend.raster.gpu.kernel import STAGED, Kernel
 from tests.backend.test_raster import NAMES, as_float32, camera, random_scene, rasterize
 from tests.backend.test_raster_stiff import assert_same_bits, draw
 
 PLANES = ("want_depth", "want_median", "want_normals", "want_distortion")
 
+TURN_AROUND = """#include "platform.h"
+KERNEL(64, 1) turn_around(float *values, int with_barrier) {
+    SHARED(float, shared, [64]);
+    shared[THREAD] = values[THREAD];
+    if (with_barrier) sync_block();
+    values[THREAD] = shared[63 - THREAD];
+}
+"""
+PART_OF_BLOCK = """#include "platform.h"
+KERNEL(64, 1) part_of_block(int with_exit) {
+    if (THREAD < 5) {
+        if (with_exit) return;
+        sync_warp();
+    }
+    sync_block();
+}
+"""
+COUNT_UP = """#include "platform.h"
+KERNEL(128, 1) count_up(float *values, int count) {
+    int i = BLOCK * THREADS_OF_BLOCK + THREAD;
+    bool last = any_in_warp(THREAD == THREADS_OF_BLOCK - 1);
+    if (i < count) values[i] += last ? 1.0f : 1000.0f;
+}
+"""
 
-def test_simulator_is_enabled():
-    assert simulated()
+
+@pytest.fixture
+def kernel_of(tmp_path, monkeypatch):
+    """A function that returns the kernel `name` of a source text."""
+    shutil.copytree(kernels.SOURCE, tmp_path / "source")
+    monkeypatch.setattr(kernels, "SOURCE", tmp_path / "source")
+
+    def make(name, text):
+        (tmp_path / "source" / f"{name}.cu").write_text(text)
+        return Kernel(name, {})
+
+    return make
 
 
-@cuda_kernel()
-def turn_around(values, with_barrier):
-    shared = cuda.shared.array(64, np.float32)
-    i = cuda.threadIdx.x
-    shared[i] = values[i]
-    if with_barrier:
-        cuda.syncthreads()
-    values[i] = shared[63 - i]
+def test_a_gpu_is_emulated():
+    assert emulated()
 
 
-def test_missing_barrier_gives_wrong_result():
+def test_missing_barrier_gives_wrong_result(kernel_of):
+    turn_around = kernel_of("turn_around", TURN_AROUND)
     right, wrong = (torch.arange(64.0) for _ in range(2))
-    launch(turn_around, 1, 64, right, True)
+    turn_around(1, 64, right, 1)
     assert torch.equal(right, torch.arange(64.0).flip(0))
-    launch(turn_around, 1, 64, wrong, False)
+    turn_around(1, 64, wrong, 0)
     assert not torch.equal(wrong, right)
 
 
-@cuda_kernel()
-def fail_in_one_thread(values):
-    cuda.syncthreads()
-    if cuda.threadIdx.x == 5:
-        raise ValueError("thread five")
-    cuda.syncthreads()
-
-
-def test_error_in_thread_ends_kernel():
-    with pytest.raises(ValueError, match="thread five"):
-        launch(fail_in_one_thread, 3, 32, torch.zeros(1))
-
-
-@cuda_kernel()
-def count_up(values):
-    i = cuda.grid(1)
-    if i < values.size:
-        values[i] += 1 if any_in_warp(i >= 0) else 100
+def test_barrier_that_only_some_threads_reach_is_an_error(kernel_of):
+    part_of_block = kernel_of("part_of_block", PART_OF_BLOCK)
+    with pytest.raises(RuntimeError, match="not all threads of a block of part_of_block"):
+        part_of_block(3, 64, 0)
+    part_of_block(3, 64, 1)  # Threads that have ended do not count.
 
 
 @pytest.mark.parametrize("count", [0, 1, 31, 32, 129])
-def test_launch_runs_one_thread_per_element(count):
+def test_one_thread_runs_for_each_element(kernel_of, count):
     values = torch.zeros(max(count, 1))
-    launch_for_each(count_up, count, values)
-    assert values.sum() == count
+    kernel_of("count_up", COUNT_UP).for_each(count, values, count)
+    # The warp of a block's last thread knows it.
+    threads = min(128, -(-count // 32) * 32)
+    expected = [1.0 if i % 128 // 32 == threads // 32 - 1 else 1000.0 for i in range(count)]
+    assert values[:count].tolist() == expected
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
 def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch):
     """The intersections and the image are recomputed, with the same result."""
     made = []
-    tile_intersections = cuda_bin.tile_intersections
+    tile_intersections = binning.tile_intersections
     monkeypatch.setattr(
-        "backend.raster.cuda.renderer.tile_intersections", lambda *a: made.append(a[-1]) or tile_intersections(*a)
+        "backend.raster.gpu.renderer.tile_intersections", lambda *a: made.append(a[-1]) or tile_intersections(*a)
     )
     scene = as_float32(random_scene(0, count=12))
     pictures = []
     for last in (10_000, 10):
-        monkeypatch.setattr(cuda_bin, "_largest_total", {torch.device("cpu"): last})
+        monkeypatch.setattr(binning, "_largest_total", {torch.device("cpu"): last})
         pictures.append(draw(scene, camera(), primitive=primitive))
     assert_same_bits(*pictures)
-    needed = cuda_bin._largest_total[torch.device("cpu")]
+    needed = binning._largest_total[torch.device("cpu")]
     assert 12 < needed < 10_000 and made == [int(10_000 * 1.125), int(10 * 1.125), needed]
 
 
 def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkeypatch):
-    monkeypatch.setattr(cuda_bin, "_largest_total", {})
+    monkeypatch.setattr(binning, "_largest_total", {})
 
     def draw_one(count):
-        total = cuda_bin.IntersectionCount(torch.tensor([count]))
+        total = binning.IntersectionCount(torch.tensor([count]))
         room = total.expected_capacity()
         assert total.wait() == count
         return room
@@ -136,7 +156,7 @@ def test_single_plane_matches_all_planes(wanted, primitive):
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_tile_intersections_match_cpu_renderer(flat):
-    """In an image of one CPU tile, that tile has the same splats as the 8 small CUDA tiles together."""
+    """In an image of one CPU tile, that tile has the same splats as the 8 small tiles of the GPU together."""
     cam = camera(64, 32)
     scene = as_float32(random_scene(4, count=50))
     cpu_frame = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam, flat=flat)
@@ -183,7 +203,7 @@ def test_splats_below_the_transmittance_threshold_have_no_gradient(primitive, fi
 
 def test_tile_with_more_splats_than_shared_memory():
     """The splats are faint, so that all of them are drawn."""
-    scene = as_float32(random_scene(0, count=STAGED + 150, size=0.3))
+    scene = as_float32(random_scene(0, count=STAGED + 600, size=0.3))
     scene["opacities"] *= 0.02
     scene["opacities"] += 0.005
     cam = camera(13, 9)
@@ -192,7 +212,7 @@ def test_tile_with_more_splats_than_shared_memory():
     other = cpu.forward(cpu.Gaussians(*(scene[n].numpy() for n in (*NAMES, "ids"))), cam)
     np.testing.assert_allclose(frame.color.numpy(), other.color, atol=1e-5)
     g_color, g_alpha = torch.ones(3, 9, 13), torch.ones(9, 13)
-    from backend.raster.cuda import renderer
+    from backend.raster.gpu import renderer
 
     mine, theirs = renderer.backward(frame, g_color, g_alpha), cpu.backward(other, g_color.numpy(), g_alpha.numpy())
     for name in NAMES:

@@ -15,18 +15,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numba import cuda
 
-from ..splats import DEPTH, HALF_H, U
-from ..tile_intersection import order_ties, row_ends, tile_rows
-from .kernel import cuda_kernel, device_function, launch_for_each
+from .kernel import TILE, kernel
 
-TILE = 16
-
-_UNSEEN = 2**63 - 1
-_SIGN = 2**31
 _SPARE, _DECAY = 1.125, 0.99
 """Ratio of the capacity to the largest number of intersections in the last images, and the factor by which a number
 counts less for each image after it."""
@@ -69,91 +61,6 @@ class Intersections:
     capacity: int
 
 
-@device_function
-def _key(bits, splats, n):
-    """Return the sort key of splat n: depth, then column.
-
-    Depths are positive, so their bit patterns have the same order as the numbers.
-    """
-    if not splats[n, HALF_H] > 0.0:
-        return np.int64(_UNSEEN)
-    across = np.int64(0)
-    if splats[n, U] != 0.0:
-        across = np.int64(bits[n, U])
-        if across < 0:
-            across = -(across & np.int64(_SIGN - 1))
-    return np.int64(bits[n, DEPTH]) * np.int64(2 * _SIGN) + across + np.int64(_SIGN)
-
-
-@cuda_kernel()
-def _write_keys(bits, splats, keys):
-    n = cuda.grid(1)
-    if n < keys.size:
-        keys[n] = _key(bits, splats, n)
-
-
-@cuda_kernel()
-def _order_equals(splats, ids, keys, order):
-    """Sort runs of equal keys; each run is sorted by the thread of its first element."""
-    first = cuda.grid(1)
-    if first + 1 >= keys.size:
-        return
-    key = keys[first]
-    if key != keys[first + 1] or key == _UNSEEN or (first > 0 and keys[first - 1] == key):
-        return
-    last = first + 2
-    while last < keys.size and keys[last] == key:
-        last += 1
-    order_ties(splats, ids, order, first, last)
-
-
-@device_function
-def _count_tiles(outlines, n, columns, lines, height):
-    """Return the number of tiles that splat n intersects."""
-    met = 0
-    top, bottom = tile_rows(outlines, n, lines, TILE)
-    for row in range(top, bottom):
-        first, last = row_ends(outlines, n, row, columns, height, TILE, TILE)
-        met += max(last - first, 0)
-    return met
-
-
-@device_function
-def _write_tiles(outlines, n, columns, lines, height, row_id, tile_ids, splat_ids):
-    """Write the tiles that splat n intersects from row `row_id` on, as far as the capacity allows."""
-    top, bottom = tile_rows(outlines, n, lines, TILE)
-    for row in range(top, bottom):
-        first, last = row_ends(outlines, n, row, columns, height, TILE, TILE)
-        for column in range(first, last):
-            if row_id < tile_ids.size:
-                tile_ids[row_id] = row * columns + column
-                splat_ids[row_id] = n
-            row_id += 1
-
-
-@cuda_kernel()
-def _count_intersections(outlines, keys, order, columns, lines, height, counts):
-    i = cuda.grid(1)
-    if i < order.size:
-        counts[i] = 0
-        if keys[i] != _UNSEEN:
-            counts[i] = _count_tiles(outlines, order[i], columns, lines, height)
-
-
-@cuda_kernel()
-def _write_intersections(
-    outlines, order, counts, cumulative, columns, lines, height, tile_ids, splat_ids, first_rows, last_rows
-):
-    i = cuda.grid(1)
-    if i < order.size:
-        n = order[i]
-        row_id = cumulative[i] - counts[i]
-        first_rows[n] = min(row_id, tile_ids.size)
-        last_rows[n] = min(cumulative[i], tile_ids.size)
-        if counts[i] > 0:
-            _write_tiles(outlines, n, columns, lines, height, row_id, tile_ids, splat_ids)
-
-
 def grid(width: int, height: int) -> tuple[int, int]:
     """Return the numbers of tile columns and tile rows."""
     return math.ceil(width / TILE), math.ceil(height / TILE)
@@ -164,13 +71,11 @@ def depth_order(splats: torch.Tensor, outlines: torch.Tensor, ids: torch.Tensor,
     count = splats.shape[0]
     columns, lines = grid(width, height)
     keys = torch.empty(count, dtype=torch.int64, device=splats.device)
-    launch_for_each(_write_keys, count, splats.view(torch.int32), splats, keys)
+    kernel("write_keys").for_each(count, splats, count, keys)
     keys, order = torch.sort(keys)
-    launch_for_each(_order_equals, count, splats, ids, keys, order)
+    kernel("order_equals").for_each(count, splats, ids, keys, count, order)
     counts = torch.empty_like(keys)
-    launch_for_each(
-        _count_intersections, count, outlines, keys, order, np.int32(columns), np.int32(lines), np.int32(height), counts
-    )
+    kernel("count_intersections").for_each(count, outlines, keys, order, count, columns, lines, height, counts)
     return Order(order, counts, torch.cumsum(counts, 0))
 
 
@@ -212,9 +117,10 @@ def tile_intersections(order: Order, outlines: torch.Tensor, width: int, height:
     tile_ids = torch.full((capacity,), count, dtype=kind, device=device)
     splat_ids = torch.zeros(capacity, dtype=torch.int32, device=device)
     first_rows, last_rows = torch.empty_like(order.order), torch.empty_like(order.order)
-    launch_for_each(
-        _write_intersections, order.order.numel(), outlines, order.order, order.counts, order.cumulative,
-        np.int32(columns), np.int32(lines), np.int32(height), tile_ids, splat_ids, first_rows, last_rows,
+    splats = order.order.numel()
+    kernel("write_intersections", TILE_ID="short" if kind is torch.int16 else "int").for_each(
+        splats, outlines, order.order, order.counts, order.cumulative, splats, columns, lines, height, capacity,
+        tile_ids, splat_ids, first_rows, last_rows,
     )  # fmt: skip
     tile_ids, isect_rows = torch.sort(tile_ids, stable=True)
     isect_offsets = torch.searchsorted(tile_ids, torch.arange(count + 1, dtype=kind, device=device))

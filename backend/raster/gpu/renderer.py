@@ -1,22 +1,17 @@
-"""The CUDA renderer on tensors in device memory; see `backend.raster` for the torch interface, and cpu/renderer.py."""
+"""The GPU renderer on tensors in device memory; see `backend.raster` for the torch interface, and cpu/renderer.py."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 
 from ..camera import Camera
 from ..discs import TILT_COLUMNS
 from ..splats import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, gradient_columns, view_of
 from .binning import IntersectionCount, Intersections, depth_order, grid, tile_intersections
-from .blending import blend_kernel
-from .blending_backward import blend_backward_kernel
 from .ids import most_probable
-from .kernel import launch, launch_for_each
-from .projection import SPLATS_PER_BLOCK, project_backward_kernel, project_kernel
-from .staging import THREADS, Wanted
+from .kernel import SPLATS_PER_BLOCK, THREADS, kernel
 
 
 @dataclass
@@ -80,9 +75,9 @@ def forward(
     tilts = torch.empty((count, TILT_COLUMNS), device=device) if flat else None
     outlines = torch.empty((count, SPLAT_COLUMNS), device=device) if flat else splats
     view = torch.from_numpy(view_of(camera, flat)).to(device, non_blocking=True)
-    launch_for_each(
-        project_kernel(flat), count, g.means, g.quats, g.scales, g.opacities, g.sh, view, np.int32(width),
-        np.int32(height), splats, splats if tilts is None else tilts, outlines,
+    kernel("project", FLAT=flat, COEFFICIENTS=g.sh.shape[1]).for_each(
+        count, g.means, g.quats, g.scales, g.opacities, g.sh, view, count, width, height, splats, tilts,
+        outlines if flat else None,
     )  # fmt: skip
     order = depth_order(splats, outlines, g.ids, width, height)
     total = IntersectionCount(order.cumulative)
@@ -96,15 +91,17 @@ def forward(
     label_probability, depth, median = planes(labels is not None), planes(want_depth), planes(want_median)
     normals, moments = planes(want_normals, 3), planes(want_moments, 2)
     isect_counts = torch.empty(columns * lines, dtype=torch.int32, device=device)
-    wanted = Wanted(flat, labels is not None, want_depth, want_median, want_normals, want_moments)
+    blend = kernel(
+        "blend", FLAT=flat, LABELS=labels is not None, DEPTHS=want_depth, MEDIAN=want_median, NORMALS=want_normals,
+        MOMENTS=want_moments,
+    )  # fmt: skip
     capacity = total.expected_capacity()
     while True:
         intersections = tile_intersections(order, outlines, width, height, capacity)
-        launch(
-            blend_kernel(wanted), columns * lines, THREADS, *_kernel_inputs(splats, tilts, g.ids, labels),
-            intersections.isect_offsets, intersections.isect_ids, np.int32(columns), color, transmittance,
-            _or(label_probability, transmittance), _or(depth, transmittance), _or(median, transmittance),
-            _or(normals, color), _or(moments, color), isect_counts,
+        blend(
+            columns * lines, THREADS, splats, tilts, g.ids, labels, intersections.isect_offsets,
+            intersections.isect_ids, columns, width, height, color, transmittance, label_probability, depth, median,
+            normals, moments, isect_counts,
         )  # fmt: skip
         needed = total.wait()
         if needed <= capacity:
@@ -114,21 +111,6 @@ def forward(
         g, camera, labels, color, transmittance, label_probability, depth, median, normals, moments, splats, tilts,
         view, intersections, isect_counts,
     )  # fmt: skip
-
-
-def _or(plane: torch.Tensor | None, stand_in: torch.Tensor) -> torch.Tensor:
-    """Return the plane, or `stand_in` if it is None, since a kernel requires an argument also for unused planes."""
-    return stand_in if plane is None else plane
-
-
-def _kernel_inputs(
-    splats: torch.Tensor, tilts: torch.Tensor | None, ids: torch.Tensor, labels: torch.Tensor | None
-) -> tuple[torch.Tensor, ...]:
-    """Return splats, tilts, IDs and labels for the kernels, with at least one element each."""
-    if not splats.shape[0]:
-        splats = splats.new_empty((1, SPLAT_COLUMNS))
-        tilts, ids = splats, ids.new_empty(1)
-    return splats, _or(tilts, splats), ids, _or(labels, ids.view(1, -1))
 
 
 def backward(
@@ -144,32 +126,36 @@ def backward(
     g = frame.gaussians
     flat = frame.tilts is not None
     count = g.means.shape[0]
-    wanted = Wanted(
-        flat, frame.labels is not None and g_label_probability is not None,
-        frame.depth is not None and g_depth is not None, False,
-        frame.normals is not None and g_normals is not None, frame.moments is not None and g_moments is not None,
+    labels = frame.labels if g_label_probability is not None else None
+    with_normals = frame.normals is not None and g_normals is not None
+    columns_of_row = gradient_columns(flat, with_normals)
+    row = GRADIENT_COLUMNS * (2 if with_normals else 1)
+    blend_backward = kernel(
+        "blend_backward", FLAT=flat, LABELS=labels is not None, DEPTHS=frame.depth is not None and g_depth is not None,
+        NORMALS=with_normals, MOMENTS=frame.moments is not None and g_moments is not None, COLUMNS=columns_of_row,
+        ROW=row,
     )  # fmt: skip
-    intersections, plane = frame.intersections, frame.transmittance
-    columns, lines = grid(frame.camera.width, frame.camera.height)
-    rows = g.means.new_empty((intersections.capacity, GRADIENT_COLUMNS * (2 if wanted.normals else 1)))
-    launch(
-        blend_backward_kernel(wanted), columns * lines, THREADS,
-        *_kernel_inputs(frame.splats, frame.tilts, g.ids, frame.labels), intersections.isect_offsets,
-        intersections.isect_ids, intersections.isect_rows, frame.isect_counts, np.int32(columns), frame.color, plane,
-        _or(frame.label_probability, plane), _or(frame.depth, plane), _or(frame.normals, frame.color),
-        _or(frame.moments, frame.color), g_color, g_alpha, _or(g_label_probability, plane), _or(g_depth, plane),
-        _or(g_normals, frame.color), _or(g_moments, frame.color), rows,
+    intersections = frame.intersections
+    height, width = frame.transmittance.shape
+    columns, lines = grid(width, height)
+    rows = g.means.new_empty((intersections.capacity, row))
+    blend_backward(
+        columns * lines, THREADS, frame.splats, frame.tilts, g.ids, labels, intersections.isect_offsets,
+        intersections.isect_ids, intersections.isect_rows, frame.isect_counts, columns, width, height, frame.color,
+        frame.transmittance, frame.label_probability, frame.depth, frame.normals, frame.moments, g_color, g_alpha,
+        g_label_probability, g_depth, g_normals, g_moments, rows,
     )  # fmt: skip
     out = Gaussians(
         torch.empty_like(g.means), torch.empty_like(g.quats), torch.empty_like(g.scales),
         torch.empty_like(g.opacities), torch.empty_like(g.sh), g.ids.new_empty(0),
     )  # fmt: skip
     frame.screen_gradient = g.means.new_empty((count, 2))
-    kernel = project_backward_kernel(flat, gradient_columns(flat, wanted.normals))
-    launch(
-        kernel, -(-count // SPLATS_PER_BLOCK), SPLATS_PER_BLOCK, g.means, g.quats, g.scales, g.opacities, g.sh,
-        frame.view, frame.splats, _or(frame.tilts, frame.splats), intersections.first_rows, intersections.last_rows,
-        rows, out.means, out.quats, out.scales, out.opacities, out.sh, frame.screen_gradient,
+    kernel(
+        "project_backward", FLAT=flat, COEFFICIENTS=g.sh.shape[1], NORMALS=with_normals, COLUMNS=columns_of_row, ROW=row
+    )(
+        -(-count // SPLATS_PER_BLOCK), SPLATS_PER_BLOCK, g.means, g.quats, g.scales, g.opacities, g.sh, frame.view,
+        frame.splats, intersections.first_rows, intersections.last_rows, rows, count, out.means,
+        out.quats, out.scales, out.opacities, out.sh, frame.screen_gradient,
     )  # fmt: skip
     return out
 
@@ -178,16 +164,9 @@ def object_ranks(frame: Frame, ranks: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Rank the most probable IDs of each pixel; see `backend.raster.object_ranks`."""
     best_probability = frame.transmittance.new_zeros((ranks, *frame.transmittance.shape))
     best_id = torch.full_like(best_probability, -1, dtype=torch.int32)
-    splats, tilts, ids, _ = _kernel_inputs(frame.splats, frame.tilts, frame.gaussians.ids, None)
     columns, _ = grid(frame.camera.width, frame.camera.height)
     most_probable(
-        splats,
-        None if frame.tilts is None else tilts,
-        ids,
-        frame.intersections,
-        frame.isect_counts,
-        columns,
-        best_id,
+        frame.splats, frame.tilts, frame.gaussians.ids, frame.intersections, frame.isect_counts, columns, best_id,
         best_probability,
-    )
+    )  # fmt: skip
     return best_id, best_probability

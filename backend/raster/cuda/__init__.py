@@ -1,1 +1,0 @@
-"""The CUDA renderer, in numba-cuda."""

@@ -1,0 +1,197 @@
+"""The GPU kernels: emulated on the CPU, compiled for GPUs, and launched through the driver's interface.
+
+Whether a GPU is emulated is decided when the renderer is imported, so each test runs other test files in a process of
+its own.
+"""
+
+import ctypes
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from backend.raster.gpu import driver
+from backend.raster.gpu.kernel import SOURCE, kernel, source_of
+
+ROOT = Path(__file__).parents[2]
+HERE = Path("tests") / "backend"
+DISCS_WITH_SURFACES = {"FLAT": True, "LABELS": True, "DEPTHS": True, "MEDIAN": False, "NORMALS": True, "MOMENTS": True}
+OF_ROWS = [{"COLUMNS": 10, "ROW": 16}, {"COLUMNS": 19, "ROW": 32}]
+VARIANTS = [
+    *[("project", {"FLAT": flat, "COEFFICIENTS": count}) for flat in (False, True) for count in (1, 16)],
+    ("write_keys", {}), ("order_equals", {}), ("count_intersections", {}),
+    *[("write_intersections", {"TILE_ID": kind}) for kind in ("short", "int")],
+    *[("rank_ids", {"FLAT": flat}) for flat in (False, True)],
+    *[(name, dict.fromkeys(DISCS_WITH_SURFACES, False) | OF_ROWS[0]) for name in ("blend", "blend_backward")],
+    *[(name, DISCS_WITH_SURFACES | OF_ROWS[1]) for name in ("blend", "blend_backward")],
+    ("project_backward", {"FLAT": False, "NORMALS": False, "COEFFICIENTS": 1, **OF_ROWS[0]}),
+    ("project_backward", {"FLAT": True, "NORMALS": True, "COEFFICIENTS": 16, **OF_ROWS[1]}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "files",
+    [["emulated_gpu.py", "test_raster.py"], ["test_raster_properties.py"], ["test_raster_stiff.py"]],
+    ids=["random scenes", "properties", "stiff scenes"],
+)
+def test_emulated_kernels(files):
+    """The tests of the CPU renderer, with the GPU renderer."""
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "--durations=5",
+         *(HERE / file for file in files)],
+        cwd=ROOT, env=os.environ | {"OBJECTGS_EMULATE_GPU": "1"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert " passed" in done.stdout
+
+
+def test_every_kernel_is_compiled():
+    assert {name for name, _ in VARIANTS} == {path.stem for path in SOURCE.glob("*.cu")}
+
+
+@pytest.mark.skipif(not shutil.which("nvcc"), reason="needs NVIDIA's compiler")
+@pytest.mark.parametrize("architecture", ["sm_75", "sm_90"])
+def test_kernels_compile_for_nvidia_gpus(architecture, tmp_path):
+    """All variants in one file, each in a namespace of its own."""
+    texts = []
+    for number, (name, variant) in enumerate(VARIANTS):
+        lines = source_of(name, variant).splitlines()
+        macros = [line.split()[1].partition("(")[0] for line in lines if line.startswith("#define ")]
+        text = "\n".join(lines).replace(f" {name}(", f" {name}_{number}(")
+        texts.append(f"namespace kernel_{number} {{\n{text}\n}}\n" + "".join(f"#undef {macro}\n" for macro in macros))
+    source = tmp_path / "kernels.cu"
+    source.write_text("".join(texts))
+    options = ["-cubin", f"-arch={architecture}", "--resource-usage", "-o", tmp_path / "kernels.cubin"]
+    done = subprocess.run(["nvcc", *options, source], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    usage = done.stdout + done.stderr
+    assert usage.count("bytes spill stores") >= len(VARIANTS)
+    # What does not fit into registers would be kept in memory.
+    assert usage.count(" 0 bytes spill stores, 0 bytes spill loads") == usage.count("bytes spill stores"), usage
+
+
+class Machine:
+    """Stands for NVRTC and the driver: keeps what is compiled and launched, and can fail."""
+
+    def __init__(self, status=0):
+        self.compiled, self.launched, self.status = [], [], status
+
+    def nvrtcCreateProgram(self, program, source, name, *_):
+        program._obj.value = 7
+        self.compiled.append((name.decode(), source.decode()))
+        return 0
+
+    def nvrtcCompileProgram(self, program, count, options):
+        self.options = [options[i].decode() for i in range(count)]
+        return self.status
+
+    def nvrtcGetProgramLogSize(self, program, size):
+        size._obj.value = len(b"line 7 is wrong") + 1
+
+    def nvrtcGetProgramLog(self, program, log):
+        log.value = b"line 7 is wrong"
+
+    def nvrtcGetCUBINSize(self, program, size):
+        size._obj.value = 4
+
+    def nvrtcGetCUBIN(self, program, binary):
+        binary.raw = b"code"
+
+    def nvrtcDestroyProgram(self, program):
+        return 0
+
+    def cuModuleLoadData(self, module, binary):
+        assert binary == b"code"
+        return 0
+
+    def cuModuleGetFunction(self, function, module, name):
+        function._obj.value = 9
+        self.name = name.decode()
+        return 0
+
+    def cuGetErrorString(self, status, text):
+        text._obj.value = b"out of memory"
+
+    def cuLaunchKernel(self, function, *words):
+        *sizes, shared, stream, pointers, extra = words
+        values = [ctypes.cast(p, ctypes.POINTER(ctypes.c_uint64))[0] for p in pointers]
+        self.launched.append((sizes, shared, stream.value, values, extra))
+        return self.status
+
+
+@pytest.fixture
+def machine(monkeypatch, tmp_path):
+    made = Machine()
+    stream = SimpleNamespace(cuda_stream=1234, synchronize=lambda: None)
+    monkeypatch.setattr(driver.libraries, "_get_gpu_runtime_library", lambda: made)
+    monkeypatch.setattr(driver.libraries, "_get_gpu_rtc_library", lambda: made)
+    monkeypatch.setattr(torch.cuda, "init", lambda: None)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: stream)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (8, 9))
+    monkeypatch.setattr(driver.numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    driver._compiler.cache_clear()
+    kernel.cache_clear()
+    yield made
+    driver._compiler.cache_clear()
+    kernel.cache_clear()
+
+
+def test_kernel_is_compiled_once_and_launched_with_its_arguments(machine):
+    splats, keys = torch.zeros(3, 12), torch.zeros(3, dtype=torch.int64)
+    for _ in range(2):
+        kernel("write_keys")(5, 128, splats, 3, keys)
+    assert machine.launched == [
+        ([5, 1, 1, 128, 1, 1], 0, 1234, [splats.data_ptr(), 3, keys.data_ptr()], None),
+    ] * 2  # fmt: skip
+    assert machine.name == "write_keys" and machine.options[0] == "--gpu-architecture=sm_89"
+    ((name, source),) = machine.compiled
+    assert name == "write_keys.cu" and "EMULATED 1" not in source and "ucontext" not in source
+    # Another process finds the binary in the cache.
+    kernel.cache_clear()
+    kernel("write_keys")(1, 128, splats, 3, keys)
+    assert len(machine.compiled) == 1 and len(machine.launched) == 3
+
+
+def test_nothing_is_launched_for_no_elements(machine):
+    kernel("write_keys").for_each(0, torch.zeros(1, 12), 0, torch.zeros(0, dtype=torch.int64))
+    assert not machine.launched
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (torch.zeros(3, 12, dtype=torch.float64), 3, torch.zeros(3, dtype=torch.int64)),
+        (torch.zeros(12, 3).T, 3, torch.zeros(3, dtype=torch.int64)),
+        (torch.zeros(3, 12), 3, torch.zeros(3, dtype=torch.int32)),
+        (torch.zeros(3, 12), torch.zeros(1), torch.zeros(3, dtype=torch.int64)),
+        (torch.zeros(3, 12), None, torch.zeros(3, dtype=torch.int64)),
+        (3, 3, torch.zeros(3, dtype=torch.int64)),
+        (torch.zeros(3, 12), 3),
+    ],
+)
+def test_arguments_of_other_types_are_rejected(machine, arguments):
+    with pytest.raises(TypeError, match="write_keys"):
+        kernel("write_keys")(1, 32, *arguments)
+    assert not machine.launched
+
+
+def test_errors_of_compiler_and_driver_are_passed_on(machine):
+    arguments = torch.zeros(3, 12), 3, torch.zeros(3, dtype=torch.int64)
+    kernel("write_keys")(1, 32, *arguments)
+    machine.status = 2
+    with pytest.raises(RuntimeError, match="CUDA error: out of memory"):
+        kernel("write_keys")(1, 32, *arguments)
+    with pytest.raises(RuntimeError, match="cannot be compiled:\nline 7 is wrong"):
+        kernel("order_equals")(1, 32, None, None, None, 3, None)
+
+
+def test_source_depends_on_constants_and_variant():
+    """So that a binary in the cache is of the same constants."""
+    flat, round_ = (source_of("blend", DISCS_WITH_SURFACES | {"FLAT": flat}) for flat in (True, False))
+    assert "#define FLAT 1\n" in flat and "#define FLAT 0\n" in round_
+    assert "#define ALPHA_MAX (0.99)\n" in flat and "U = 0, V = 1" in flat and "#include" not in flat
