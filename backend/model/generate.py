@@ -8,16 +8,22 @@ not generated.
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from ..gpu.kernel import WARP, kernel
 from ..raster import devices
 from .anchors import LOG_EXTENT_MAX, Layout
 from .generate_on_cpu import RAW_OPACITY_MIN, Generate
-from .heads import Heads
+from .heads import HIDDEN, Heads
+
+_THREADS = 128
+"""Number of threads per block of the gradient on a GPU, if an anchor has no more offsets."""
 
 
 class Generated(NamedTuple):
@@ -54,38 +60,62 @@ class Generated(NamedTuple):
         return self if self.valid is None else self.select(self.valid)._replace(valid=None)
 
 
-def _on_gpu(
-    layout: Layout,
-    positions: torch.Tensor,
-    rows: torch.Tensor,
-    ids: torch.Tensor,
-    heads: Heads,
-    seen_from: torch.Tensor | None,
-    present: torch.Tensor | None,
-) -> Generated:
-    """Evaluate the equations in torch, with an entry for every offset, so that no synchronization is necessary."""
-    n, k = len(rows), layout.offsets
-    # A single split, so that the gradient is assembled in one pass.
-    offsets, extents, features, row_opacity, row_shape, row_color = rows.split(
-        [3 * k, 6, layout.features, k, 7 * k, 3 * k], 1
-    )
-    raw_opacity, shape, color = heads(features if seen_from is None else torch.cat([features, seen_from], 1))
-    raw_opacity = raw_opacity + row_opacity
-    valid = raw_opacity > float(RAW_OPACITY_MIN)
-    if present is not None:
-        valid = valid & present[:, None]
-    # The clamp passes the gradient, so that an extent beyond the limit can return.
-    extent = (extents + (extents.clamp(max=LOG_EXTENT_MAX) - extents).detach()).exp()
-    raw_scale, quats = (shape + row_shape).view(n, k, 7).split([3, 4], 2)
-    means = positions[:, None] + offsets.view(n, k, 3) * extent[:, None, :3]
-    scales = extent[:, None, 3:] * raw_scale.sigmoid()
-    sh = color.view(n, k, -1, 3)
-    sh = torch.cat([sh[:, :, :1] + row_color.view(n, k, 1, 3), sh[:, :, 1:]], 2)
-    return Generated(
-        means.reshape(-1, 3), quats.reshape(-1, 4), scales.reshape(-1, 3),
-        torch.where(valid, raw_opacity.tanh(), 0.0).reshape(-1), sh.reshape(n * k, -1, 3),
-        ids[:, None].expand(n, k).reshape(-1), torch.arange(n * k, device=rows.device), valid.reshape(-1),
-    )  # fmt: skip
+class _GenerateOnGpu(torch.autograd.Function):
+    """The equations with an entry for every offset, so that no synchronization is necessary."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        positions: torch.Tensor,
+        rows: torch.Tensor,
+        ids: torch.Tensor,
+        seen_from: torch.Tensor | None,
+        present: torch.Tensor | None,
+        layout: Layout,
+        *parameters: torch.Tensor,
+    ) -> tuple[torch.Tensor, ...]:
+        n, k = len(rows), layout.offsets
+        features = rows[:, layout.feature_columns]
+        inputs = features if seen_from is None else torch.cat([features, seen_from], 1)
+        (w_hidden, b_hidden), *heads = zip(parameters[::2], parameters[1::2], strict=True)
+        hidden = torch.addmm(b_hidden, inputs, w_hidden.T).relu_()
+        units = hidden.split(HIDDEN, 1)
+        outputs = [torch.addmm(b, x, w.T) for x, (w, b) in zip(units, heads, strict=True)]
+        coefficients = len(parameters[-1]) // (3 * k)
+        ctx.constants = {
+            "OFFSETS": k, "FEATURES": layout.features, "COEFFICIENTS": coefficients, "LOG_EXTENT_MAX": LOG_EXTENT_MAX,
+            "RAW_OPACITY_MIN": float(RAW_OPACITY_MIN),
+        }  # fmt: skip
+        count = n * k
+        means, quats, scales = (rows.new_empty((count, width)) for width in (3, 4, 3))
+        opacities, sh = rows.new_empty(count), rows.new_empty((count, coefficients, 3))
+        of_splats, valid = ids.new_empty(count), torch.empty(count, dtype=torch.bool, device=rows.device)
+        kernel("generate", **ctx.constants).for_each(
+            count, positions, ids, rows, *outputs, present, count, means, quats, scales, opacities, sh, of_splats, valid
+        )
+        ctx.layout, ctx.parameters = layout, parameters
+        ctx.save = rows, inputs, hidden, scales, opacities, valid
+        ctx.mark_non_differentiable(of_splats, valid)
+        return means, quats, scales, opacities, sh, of_splats, valid
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        rows, inputs, hidden, scales, opacities, valid = ctx.save
+        layout, k = ctx.layout, ctx.layout.offsets
+        weights, biases = ctx.parameters[::2], ctx.parameters[1::2]
+        g_rows = torch.empty_like(rows)
+        g_outputs = [rows.new_empty((len(rows), len(bias))) for bias in biases[1:]]
+        threads = max(_THREADS, WARP * math.ceil(k / WARP))
+        kernel("generate_backward", THREADS_OF_GENERATE=threads, **ctx.constants)(
+            math.ceil(len(rows) / (threads // k)), threads, rows, scales, opacities, valid,
+            *(g.contiguous() for g in gradients[:5]), len(rows), g_rows, *g_outputs,
+        )  # fmt: skip
+        g_hidden = torch.cat([g @ weight for g, weight in zip(g_outputs, weights[1:], strict=True)], 1)
+        g_hidden = torch.where(hidden > 0, g_hidden, 0.0)
+        g_rows[:, layout.feature_columns] = g_hidden @ weights[0][:, : layout.features]
+        pairs = zip((g_hidden, *g_outputs), (inputs, *hidden.split(HIDDEN, 1)), strict=True)
+        of_parameters = itertools.chain.from_iterable((g.T @ x, g.sum(0)) for g, x in pairs)
+        return (None, g_rows, None, None, None, None, *of_parameters)
 
 
 def generate(
@@ -115,10 +145,13 @@ def generate(
         to_anchor = positions - devices.upload(np.asarray(camera_center, np.float32), positions)
         distance = torch.linalg.vector_norm(to_anchor, dim=1, keepdim=True).clamp(min=1e-6)
         seen_from = torch.cat([distance, to_anchor / distance], 1)
-    if devices.on_gpu(rows):
-        return _on_gpu(layout, positions, rows, ids, heads, seen_from, present)
     layers = (heads.hidden, heads.opacity, heads.shape, heads.color)
     parameters = [p for layer in layers for p in (layer.weight, layer.bias)]
+    if devices.on_gpu(rows):
+        made = _GenerateOnGpu.apply(positions, rows, ids, seen_from, present, layout, *parameters)
+        means, quats, scales, opacities, sh, of_splats, valid = made
+        source = torch.arange(len(valid), device=rows.device)
+        return Generated(means, quats, scales, opacities, sh, of_splats, source, valid)
     if seen_from is None:
         seen_from = positions.new_empty((len(positions), 0))
     *tensors, source = Generate.apply(positions, rows, seen_from, layout, *parameters)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..gpu.kernel import kernel
 from ..raster import devices
 from .anchors import Anchors, cell_keys, new_rows
 
@@ -78,8 +79,11 @@ class GrowthStatistics:
             usable: (n,) bool, only on the GPU: anchors for which it is False are ignored.
         """
         if devices.on_gpu(self.gradient):
-            drawn, screen_gradient = torch.as_tensor(drawn), torch.as_tensor(screen_gradient)
-            self._add_on_gpu(anchors_seen, offsets, opacities, drawn, screen_gradient, width, height, usable)
+            kernel("add_statistics").for_each(
+                len(anchors_seen), anchors_seen, usable, opacities, torch.as_tensor(drawn),
+                torch.as_tensor(screen_gradient), width / 2, height / 2, len(anchors_seen), offsets, self.gradient,
+                self.visits, self.opacity, self.views,
+            )  # fmt: skip
             return
         size = np.array([width / 2, height / 2], np.float32)
         norm = np.sqrt(((devices.host(screen_gradient) * size) ** 2).sum(1))
@@ -91,30 +95,6 @@ class GrowthStatistics:
         visits[place[shown]] += 1
         opacity += np.bincount(seen[sources // offsets], opacities.numpy(), minlength=len(opacity)).astype(np.float32)
         views[seen] += 1
-
-    def _add_on_gpu(
-        self,
-        anchors_seen: torch.Tensor,
-        offsets: int,
-        opacities: torch.Tensor,
-        drawn: torch.Tensor,
-        screen_gradient: torch.Tensor,
-        width: int,
-        height: int,
-        usable: torch.Tensor | None,
-    ) -> None:
-        """Implement `add` on the GPU, where every offset of the anchors has an entry among the splats."""
-        counted = torch.ones_like(anchors_seen, dtype=torch.bool) if usable is None else usable
-        drawn = drawn.view(-1, offsets) & counted[:, None]
-        norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
-        norm = norm.view(-1, offsets)
-        drawn = drawn & norm.isfinite()
-        norm = torch.where(drawn, norm, 0.0)
-        # Each anchor occurs once, so the result is deterministic.
-        self.gradient.view(-1, offsets).index_add_(0, anchors_seen, norm)
-        self.visits.view(-1, offsets).index_add_(0, anchors_seen, drawn.to(self.visits.dtype))
-        self.opacity.index_add_(0, anchors_seen, torch.where(counted, opacities.view(-1, offsets).sum(1), 0.0))
-        self.views.index_add_(0, anchors_seen, counted.to(self.views.dtype))
 
     def after(self, growth: Growth, offsets: int) -> GrowthStatistics:
         """Return the statistics after a round of growth; the sums of what was seen too rarely are kept."""

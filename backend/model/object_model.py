@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from numba import prange
 
+from ..gpu.kernel import kernel as gpu_kernel
 from ..raster import devices
 from ..raster.kernel import kernel
 from ..shared.class_table import ClassTable
@@ -176,18 +177,13 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
 def _in_view_on_gpu(
     anchors: Anchors, viewmat: np.ndarray, intrinsics: np.ndarray, width: int, height: int, near: float
 ) -> torch.Tensor:
-    """Compute the same as `_in_view` in torch; returns (N,) bool."""
-    k, rows = anchors.layout.offsets, anchors.rows
-    extent = rows[:, anchors.layout.extent_columns].clamp(max=LOG_EXTENT_MAX).exp()
-    largest = rows[:, anchors.layout.offset_columns].abs().view(-1, k, 3).amax(1)
-    reach = torch.linalg.vector_norm(largest * extent[:, :3], dim=1) + 3.4 * extent[:, 3:].amax(1)
-    turned = devices.upload(np.ascontiguousarray(viewmat[:3], np.float32), rows)
-    x, y, z = (anchors.positions @ turned[:, :3].T + turned[:, 3]).unbind(1)
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
-    room = -reach - 2.4 / min(fx, fy) * z.clamp(min=near)
-    inside = z + reach > near
-    for across, focal, to_edge in ((x, fx, cx), (x, -fx, width - cx), (y, fy, cy), (y, -fy, height - cy)):
-        inside = inside & ((focal * across + to_edge * z) / np.hypot(focal, to_edge) > room)
+    """Compute the same as `_in_view`; returns (N,) int32."""
+    view = np.concatenate([viewmat[:3].ravel(), intrinsics, [width, height, near]]).astype(np.float32)
+    inside = torch.empty(len(anchors), dtype=torch.int32, device=anchors.rows.device)
+    gpu_kernel("find_in_view", OFFSETS=anchors.layout.offsets, LOG_EXTENT_MAX=LOG_EXTENT_MAX).for_each(
+        len(anchors), anchors.positions, anchors.rows, len(anchors), anchors.layout.columns,
+        devices.upload(view, anchors.rows), inside,
+    )  # fmt: skip
     return inside
 
 
@@ -231,8 +227,8 @@ def first_anchors_in_view(
     """
     inside = _in_view_on_gpu(anchors, viewmat, intrinsics, width, height, near)
     before = inside.cumsum(0)
-    every = torch.arange(len(anchors), device=inside.device)
-    count = before[-1] if len(anchors) else every.sum()
-    place = torch.where(inside, before - 1, count + every - before)
-    index = torch.empty_like(every).scatter_(0, place, every)[:limit]
-    return index, every[:limit] < count, count
+    count = min(limit, len(anchors))
+    index = torch.empty(count, dtype=torch.int64, device=inside.device)
+    in_view = torch.empty(count, dtype=torch.bool, device=inside.device)
+    gpu_kernel("place_in_view").for_each(len(anchors), inside, before, len(anchors), count, index, in_view)
+    return index, in_view, before[-1] if len(anchors) else before.sum()

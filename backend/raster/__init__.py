@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from ..gpu.emulator import emulated
 from .camera import Camera
 from .cpu import renderer as cpu
-from .devices import emulated
 
 __all__ = ["Camera", "Rendered", "compile_kernels", "object_map", "object_ranks", "rasterize"]
 

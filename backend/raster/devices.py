@@ -7,11 +7,11 @@ Functions with an implementation for each device call `on_gpu` with one of their
 from __future__ import annotations
 
 import functools
-import os
 
 import numpy as np
 import torch
 
+from ..gpu.emulator import emulated
 from ..shared.errors import InputError
 
 CHOICES = ("auto", "cpu", "cuda")
@@ -46,11 +46,6 @@ def pick(requested: str) -> torch.device:
     if requested == "cpu" or why_not is not None or emulated():
         return CPU
     return torch.device("cuda", torch.cuda.current_device())
-
-
-def emulated() -> bool:
-    """Return whether a GPU is emulated on the CPU, for tests."""
-    return os.environ.get("OBJECTGS_EMULATE_GPU") == "1"
 
 
 def on_gpu(tensor: torch.Tensor) -> bool:
@@ -175,12 +170,12 @@ def explain_low_memory(name: str, free: float, total: float) -> str | None:
 def _problem_with_kernels() -> str | None:
     """Compile and run a small kernel, since torch has the compiler of kernels in a library of its own."""
     try:
-        from .gpu.kernel import kernel
+        from .gpu.kernels import raster_kernel
         from .splats import SPLAT_COLUMNS
 
         unseen = torch.full((1, SPLAT_COLUMNS), -1.0, device="cuda")
         keys = torch.zeros(1, dtype=torch.int64, device="cuda")
-        kernel("write_keys").for_each(1, unseen, 1, keys)
+        raster_kernel("write_keys").for_each(1, unseen, 1, keys)
         if int(keys[0]) != 2**63 - 1:
             return "A kernel ran on the GPU without effect; restart the computer."
     except Exception as error:  # For any error, the CPU can be used instead.

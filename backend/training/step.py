@@ -291,7 +291,7 @@ class ViewStep:
         finite = usable = None
         if on_gpu:
             finite = loss.isfinite() if present is None else loss.isfinite() & present.any()
-            usable = finite.expand(len(seen)) if present is None else finite & present
+            usable = finite.repeat(len(seen)) if present is None else finite & present
         return ViewGradients(camera, loss, seen, rows, finite, usable, statistics)
 
     def _parts_of(self, camera: Camera, image: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:

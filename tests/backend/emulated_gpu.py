@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from backend.gpu import kernel as kernels
+from backend.gpu.emulator import emulated
 from backend.raster.cpu import renderer as cpu
-from backend.raster.devices import emulated
 from backend.raster.gpu import binning
-from backend.raster.gpu import kernel as kernels
-from backend.raster.gpu.kernel import STAGED, Kernel
+from backend.raster.gpu.kernels import STAGED
 from tests.backend.test_raster import NAMES, as_float32, camera, random_scene, rasterize
 from tests.backend.test_raster_stiff import assert_same_bits, draw
 
@@ -34,8 +34,8 @@ KERNEL(64, 1) part_of_block(int with_exit) {
     sync_block();
 }
 """
-COUNT_UP = """#include "platform.h"
-KERNEL(128, 1) count_up(float *values, int count) {
+ADD_ONE = """#include "platform.h"
+KERNEL(128, 1) add_one(float *values, int count) {
     int i = BLOCK * THREADS_OF_BLOCK + THREAD;
     bool last = any_in_warp(THREAD == THREADS_OF_BLOCK - 1);
     if (i < count) values[i] += last ? 1.0f : 1000.0f;
@@ -51,7 +51,7 @@ def kernel_of(tmp_path, monkeypatch):
 
     def make(name, text):
         (tmp_path / "source" / f"{name}.cu").write_text(text)
-        return Kernel(name, {})
+        return kernels.Kernel(name, {})
 
     return make
 
@@ -79,7 +79,7 @@ def test_barrier_that_only_some_threads_reach_is_an_error(kernel_of):
 @pytest.mark.parametrize("count", [0, 1, 31, 32, 129])
 def test_one_thread_runs_for_each_element(kernel_of, count):
     values = torch.zeros(max(count, 1))
-    kernel_of("count_up", COUNT_UP).for_each(count, values, count)
+    kernel_of("add_one", ADD_ONE).for_each(count, values, count)
     # The warp of a block's last thread knows it.
     threads = min(128, -(-count // 32) * 32)
     expected = [1.0 if i % 128 // 32 == threads // 32 - 1 else 1000.0 for i in range(count)]

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from backend.model.growth import GrowthStatistics
-from backend.raster import devices
 from backend.shared.events import Reporter
 from backend.training import check_finite, step
 from backend.training import trainer as trainer_module
@@ -213,7 +212,7 @@ def test_overflowing_squared_gradient_is_skipped():
 
 @pytest.mark.parametrize("on_gpu", [False, True])
 def test_growth_statistics_ignore_nonfinite_gradients(monkeypatch, on_gpu):
-    monkeypatch.setattr(devices, "on_gpu", lambda tensor: on_gpu)
+    monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1" if on_gpu else "0")
     statistics = GrowthStatistics.zeros(2, 2)
     gradient = torch.tensor([[1.0, 0.0], [math.nan, 1.0], [math.inf, 0.0], [2.0, 0.0]])
     ones = torch.ones(4)
@@ -233,7 +232,7 @@ def test_faults_are_not_searched_while_values_are_finite(trainer, monkeypatch):
 
 
 def test_gpu_searches_fault_after_skipped_updates(trainer, tmp_path, monkeypatch):
-    monkeypatch.setattr(devices, "on_gpu", lambda tensor: True)
+    monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1")
     monkeypatch.setattr(trainer_module, "_REPORT_SECONDS", 0.0)
     trained = trainer()
     monkeypatch.setattr(step, "volume_loss", poisoned(step.volume_loss, False, math.nan))

@@ -35,6 +35,7 @@ from backend.training.step import strips
 from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
+EMULATE = "OBJECTGS_EMULATE_GPU"
 SMALL = Settings(offsets=4, sh_degree=1)
 FLAT = dataclasses.replace(SMALL, primitive="2d", distortion_weight=0.1)
 
@@ -46,7 +47,7 @@ def both(monkeypatch):
     def call(function):
         found = []
         for on_gpu in (False, True):
-            monkeypatch.setattr(devices, "on_gpu", lambda tensor, answer=on_gpu: answer)
+            monkeypatch.setenv(EMULATE, "1" if on_gpu else "0")
             found.append(function())
         return found
 
@@ -55,8 +56,8 @@ def both(monkeypatch):
 
 @pytest.fixture
 def as_on_gpu(monkeypatch):
-    """Function that selects the GPU path (True) or the CPU path (False)."""
-    return lambda answer: monkeypatch.setattr(devices, "on_gpu", lambda tensor: answer)
+    """Function that selects an emulated GPU (True) or the CPU (False)."""
+    return lambda answer: monkeypatch.setenv(EMULATE, "1" if answer else "0")
 
 
 def close(got, want, relative=2e-4, absolute=2e-5):
@@ -209,8 +210,7 @@ def test_normal_loss_matches(both):
         close(a, b, 1e-3, 1e-4)
 
 
-def test_adam_updates_seen_usable_finite_rows(both, monkeypatch):
-    monkeypatch.setattr("backend.training.optimizer.adam._ROWS_AT_ONCE", 4)
+def test_adam_updates_seen_usable_finite_rows(both, as_on_gpu):
     rng = np.random.default_rng(0)
     base = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
     seen = torch.tensor([1, 4, 7, 9, 12, 19])
@@ -228,6 +228,7 @@ def test_adam_updates_seen_usable_finite_rows(both, monkeypatch):
     for a, b in zip(got[1:], want[1:], strict=True):
         close(a, b, 3e-5, 1e-7)
     assert torch.equal(got[1][7], base[7]) and not torch.equal(got[1][9], base[9])
+    as_on_gpu(True)
     skipped, values, exp_avg, _ = step(torch.tensor([True, False, False, True, True, True]))
     assert skipped == 0 and torch.equal(values[4], base[4]) and torch.equal(exp_avg[4], base[4] * 0.1)
     assert torch.equal(values[9], got[1][9])
@@ -419,7 +420,7 @@ def test_training_on_an_emulated_gpu_matches_cpu(write_capture, tmp_path):
     found = []
     for emulate in ("0", "1"):
         command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache")]
-        environment = {**os.environ, "OBJECTGS_EMULATE_GPU": emulate}
+        environment = {**os.environ, EMULATE: emulate}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
         assert done.returncode == 0, done.stderr
         found.append([float(word) for word in done.stdout.split()])

@@ -1,7 +1,6 @@
 """The GPU kernels: emulated on the CPU, compiled for GPUs, and launched through the driver's interface.
 
-Whether a GPU is emulated is decided when the renderer is imported, so each test runs other test files in a process of
-its own.
+The tests of the CPU renderer run again, in processes of their own, in which a GPU is emulated.
 """
 
 import ctypes
@@ -15,23 +14,42 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from backend.raster.gpu import driver
-from backend.raster.gpu.kernel import SOURCE, kernel, source_of
+from backend.gpu import driver
+from backend.gpu.kernel import SOURCE, source_of
+from backend.raster.gpu.kernels import constants, raster_kernel
 
 ROOT = Path(__file__).parents[2]
 HERE = Path("tests") / "backend"
-DISCS_WITH_SURFACES = {"FLAT": True, "LABELS": True, "DEPTHS": True, "MEDIAN": False, "NORMALS": True, "MOMENTS": True}
+SURFACE = {"DEPTHS": True, "MEDIAN": False, "NORMALS": True, "MOMENTS": True}
+PLAIN = dict.fromkeys(SURFACE, False)
 OF_ROWS = [{"COLUMNS": 10, "ROW": 16}, {"COLUMNS": 19, "ROW": 32}]
+OF_ANCHORS = {"OFFSETS": 10, "FEATURES": 32, "LOG_EXTENT_MAX": 20.0, "RAW_OPACITY_MIN": 0.004}
+OF_IMAGES = {"WINDOW": "{0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.05f, 0.05f}", "FLOOR": 0.01}
+OF_ADAM = {"BETA1": 0.9, "BETA2": 0.999, "EPSILON": 1e-15, "LARGEST_GRADIENT": 1e19}
 VARIANTS = [
     *[("project", {"FLAT": flat, "COEFFICIENTS": count}) for flat in (False, True) for count in (1, 16)],
     ("write_keys", {}), ("order_equals", {}), ("count_intersections", {}),
-    *[("write_intersections", {"TILE_ID": kind}) for kind in ("short", "int")],
+    *[(name, {"TILE_ID": kind}) for name in ("write_intersections", "find_tiles") for kind in ("short", "int")],
     *[("rank_ids", {"FLAT": flat}) for flat in (False, True)],
-    *[(name, dict.fromkeys(DISCS_WITH_SURFACES, False) | OF_ROWS[0]) for name in ("blend", "blend_backward")],
-    *[(name, DISCS_WITH_SURFACES | OF_ROWS[1]) for name in ("blend", "blend_backward")],
+    *[(name, {"FLAT": False, "LABELS": True, **PLAIN, **OF_ROWS[0]}) for name in ("blend", "blend_backward")],
+    *[(name, {"FLAT": True, "LABELS": True, **SURFACE, **OF_ROWS[1]}) for name in ("blend", "blend_backward")],
     ("project_backward", {"FLAT": False, "NORMALS": False, "COEFFICIENTS": 1, **OF_ROWS[0]}),
     ("project_backward", {"FLAT": True, "NORMALS": True, "COEFFICIENTS": 16, **OF_ROWS[1]}),
+    ("find_in_view", OF_ANCHORS), ("place_in_view", {}), ("add_statistics", {}),
+    ("generate", {**OF_ANCHORS, "COEFFICIENTS": 4}),
+    ("generate_backward", {**OF_ANCHORS, "COEFFICIENTS": 4, "THREADS_OF_GENERATE": 128}),
+    *[(name, {"SSIM": has_ssim, **OF_IMAGES}) for name in ("image_loss", "image_loss_total", "image_loss_backward")
+      for has_ssim in (False, True)],
+    *[(name, {"FLAT": True}) for name in ("volume", "volume_backward")], ("volume_mean", {}), ("totals", {}),
+    ("normal_loss", {"SOLID": 0.5, "GRAZING": 0.1}), ("normal_loss_backward", {}),
+    ("step_rows", {**OF_ADAM, "ROWS_PER_BLOCK": 4}),
 ]  # fmt: skip
+
+
+def text_of(name, variant):
+    """Return the source text of a kernel."""
+    of_raster = (SOURCE / "raster" / f"{name}.cu").exists()
+    return source_of(name, {**(constants() if of_raster else {}), **variant})
 
 
 @pytest.mark.parametrize(
@@ -51,7 +69,7 @@ def test_emulated_kernels(files):
 
 
 def test_every_kernel_is_compiled():
-    assert {name for name, _ in VARIANTS} == {path.stem for path in SOURCE.glob("*.cu")}
+    assert {name for name, _ in VARIANTS} == {path.stem for path in SOURCE.rglob("*.cu")}
 
 
 @pytest.mark.skipif(not shutil.which("nvcc"), reason="needs NVIDIA's compiler")
@@ -60,7 +78,7 @@ def test_kernels_compile_for_nvidia_gpus(architecture, tmp_path):
     """All variants in one file, each in a namespace of its own."""
     texts = []
     for number, (name, variant) in enumerate(VARIANTS):
-        lines = source_of(name, variant).splitlines()
+        lines = text_of(name, variant).splitlines()
         macros = [line.split()[1].partition("(")[0] for line in lines if line.startswith("#define ")]
         text = "\n".join(lines).replace(f" {name}(", f" {name}_{number}(")
         texts.append(f"namespace kernel_{number} {{\n{text}\n}}\n" + "".join(f"#undef {macro}\n" for macro in macros))
@@ -135,16 +153,20 @@ def machine(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (8, 9))
     monkeypatch.setattr(driver.numba.config, "CACHE_DIR", str(tmp_path / "cache"))
     driver._compiler.cache_clear()
-    kernel.cache_clear()
+    raster_kernel.cache_clear()
     yield made
     driver._compiler.cache_clear()
-    kernel.cache_clear()
+    raster_kernel.cache_clear()
+
+
+def write_keys():
+    return raster_kernel("write_keys")
 
 
 def test_kernel_is_compiled_once_and_launched_with_its_arguments(machine):
     splats, keys = torch.zeros(3, 12), torch.zeros(3, dtype=torch.int64)
     for _ in range(2):
-        kernel("write_keys")(5, 128, splats, 3, keys)
+        write_keys()(5, 128, splats, 3, keys)
     assert machine.launched == [
         ([5, 1, 1, 128, 1, 1], 0, 1234, [splats.data_ptr(), 3, keys.data_ptr()], None),
     ] * 2  # fmt: skip
@@ -152,13 +174,13 @@ def test_kernel_is_compiled_once_and_launched_with_its_arguments(machine):
     ((name, source),) = machine.compiled
     assert name == "write_keys.cu" and "EMULATED 1" not in source and "ucontext" not in source
     # Another process finds the binary in the cache.
-    kernel.cache_clear()
-    kernel("write_keys")(1, 128, splats, 3, keys)
+    raster_kernel.cache_clear()
+    write_keys()(1, 128, splats, 3, keys)
     assert len(machine.compiled) == 1 and len(machine.launched) == 3
 
 
 def test_nothing_is_launched_for_no_elements(machine):
-    kernel("write_keys").for_each(0, torch.zeros(1, 12), 0, torch.zeros(0, dtype=torch.int64))
+    write_keys().for_each(0, torch.zeros(1, 12), 0, torch.zeros(0, dtype=torch.int64))
     assert not machine.launched
 
 
@@ -176,22 +198,22 @@ def test_nothing_is_launched_for_no_elements(machine):
 )
 def test_arguments_of_other_types_are_rejected(machine, arguments):
     with pytest.raises(TypeError, match="write_keys"):
-        kernel("write_keys")(1, 32, *arguments)
+        write_keys()(1, 32, *arguments)
     assert not machine.launched
 
 
 def test_errors_of_compiler_and_driver_are_passed_on(machine):
     arguments = torch.zeros(3, 12), 3, torch.zeros(3, dtype=torch.int64)
-    kernel("write_keys")(1, 32, *arguments)
+    write_keys()(1, 32, *arguments)
     machine.status = 2
     with pytest.raises(RuntimeError, match="CUDA error: out of memory"):
-        kernel("write_keys")(1, 32, *arguments)
+        write_keys()(1, 32, *arguments)
     with pytest.raises(RuntimeError, match="cannot be compiled:\nline 7 is wrong"):
-        kernel("order_equals")(1, 32, None, None, None, 3, None)
+        raster_kernel("order_equals")(1, 32, None, None, None, 3, None)
 
 
 def test_source_depends_on_constants_and_variant():
     """So that a binary in the cache is of the same constants."""
-    flat, round_ = (source_of("blend", DISCS_WITH_SURFACES | {"FLAT": flat}) for flat in (True, False))
+    flat, round_ = (text_of("blend", {"LABELS": True, **PLAIN, "FLAT": flat}) for flat in (True, False))
     assert "#define FLAT 1\n" in flat and "#define FLAT 0\n" in round_
     assert "#define ALPHA_MAX (0.99)\n" in flat and "U = 0, V = 1" in flat and "#include" not in flat

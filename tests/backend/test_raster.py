@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from backend import raster
+from backend.gpu.emulator import emulated
 from backend.raster import Camera, object_map, object_ranks
-from backend.raster.devices import emulated
 from backend.raster.reference import rasterize_reference
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")

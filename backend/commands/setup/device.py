@@ -18,8 +18,8 @@ from pathlib import Path
 
 import torch
 
+from ...gpu.kernel import digest_of_sources
 from ...raster import devices
-from ...raster.gpu.kernel import digest_of_sources
 from ...raster.kernel import digest_up_to
 from ...shared.errors import InputError
 from ...shared.events import Reporter

@@ -13,6 +13,7 @@ import llvmlite.binding
 import numba
 import torch
 
+from ...gpu.emulator import emulated
 from ...raster import compile_kernels, devices
 from ...raster.kernel import digest_up_to
 from ...shared.events import Reporter
@@ -104,7 +105,7 @@ class _Steps(Reporter):
 
 def _are_ready(device: torch.device) -> bool:
     """Return whether an earlier run compiled the kernels; an emulated GPU needs no compilation."""
-    return devices.emulated() or _mark(device).exists()
+    return emulated() or _mark(device).exists()
 
 
 def _mark(device: torch.device) -> Path:

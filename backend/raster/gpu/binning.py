@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import torch
 
-from .kernel import TILE, kernel
+from .kernels import TILE, raster_kernel
 
 _SPARE, _DECAY = 1.125, 0.99
 """Ratio of the capacity to the largest number of intersections in the last images, and the factor by which a number
@@ -71,11 +71,11 @@ def depth_order(splats: torch.Tensor, outlines: torch.Tensor, ids: torch.Tensor,
     count = splats.shape[0]
     columns, lines = grid(width, height)
     keys = torch.empty(count, dtype=torch.int64, device=splats.device)
-    kernel("write_keys").for_each(count, splats, count, keys)
+    raster_kernel("write_keys").for_each(count, splats, count, keys)
     keys, order = torch.sort(keys)
-    kernel("order_equals").for_each(count, splats, ids, keys, count, order)
+    raster_kernel("order_equals").for_each(count, splats, ids, keys, count, order)
     counts = torch.empty_like(keys)
-    kernel("count_intersections").for_each(count, outlines, keys, order, count, columns, lines, height, counts)
+    raster_kernel("count_intersections").for_each(count, outlines, keys, order, count, columns, lines, height, counts)
     return Order(order, counts, torch.cumsum(counts, 0))
 
 
@@ -102,7 +102,7 @@ class IntersectionCount:
         """Wait for the number of intersections and return it."""
         if self._event is not None:
             self._event.synchronize()
-        total = int(self._host[0])
+        total = int(self._host.numpy()[0])
         _largest_total[self._device] = max(total, _DECAY * _largest_total.get(self._device, 0))
         return total
 
@@ -115,13 +115,18 @@ def tile_intersections(order: Order, outlines: torch.Tensor, width: int, height:
     # With fewer bits, the sort has fewer passes.
     kind = torch.int16 if count < 2**15 else torch.int32
     tile_ids = torch.full((capacity,), count, dtype=kind, device=device)
-    splat_ids = torch.zeros(capacity, dtype=torch.int32, device=device)
+    splat_ids = torch.empty(capacity, dtype=torch.int32, device=device)
     first_rows, last_rows = torch.empty_like(order.order), torch.empty_like(order.order)
     splats = order.order.numel()
-    kernel("write_intersections", TILE_ID="short" if kind is torch.int16 else "int").for_each(
+    name = "short" if kind is torch.int16 else "int"
+    raster_kernel("write_intersections", TILE_ID=name).for_each(
         splats, outlines, order.order, order.counts, order.cumulative, splats, columns, lines, height, capacity,
         tile_ids, splat_ids, first_rows, last_rows,
     )  # fmt: skip
     tile_ids, isect_rows = torch.sort(tile_ids, stable=True)
-    isect_offsets = torch.searchsorted(tile_ids, torch.arange(count + 1, dtype=kind, device=device))
-    return Intersections(isect_offsets, splat_ids[isect_rows], isect_rows, first_rows, last_rows, capacity)
+    isect_offsets = torch.empty(count + 1, dtype=torch.int64, device=device)
+    isect_ids = torch.empty_like(splat_ids)
+    raster_kernel("find_tiles", TILE_ID=name).for_each(
+        capacity, tile_ids, isect_rows, splat_ids, count, capacity, isect_offsets, isect_ids
+    )
+    return Intersections(isect_offsets, isect_ids, isect_rows, first_rows, last_rows, capacity)

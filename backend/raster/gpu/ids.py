@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from .binning import Intersections
-from .kernel import THREADS, kernel
+from .kernels import THREADS, raster_kernel
 
 
 def _number(
@@ -59,7 +59,7 @@ def most_probable(
         return
     slots, names, bounds = _number(intersections, ids, isect_counts)
     ranks, height, width = best_id.shape
-    kernel("rank_ids", FLAT=tilts is not None)(
+    raster_kernel("rank_ids", FLAT=tilts is not None)(
         isect_counts.numel(), THREADS, splats, tilts, slots, names, bounds, intersections.isect_offsets,
         intersections.isect_ids, isect_counts, columns, width, height, ranks, best_id, best_probability,
     )  # fmt: skip

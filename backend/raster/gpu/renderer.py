@@ -11,7 +11,7 @@ from ..discs import TILT_COLUMNS
 from ..splats import GRADIENT_COLUMNS, HALF_H, SPLAT_COLUMNS, gradient_columns, view_of
 from .binning import IntersectionCount, Intersections, depth_order, grid, tile_intersections
 from .ids import most_probable
-from .kernel import SPLATS_PER_BLOCK, THREADS, kernel
+from .kernels import SPLATS_PER_BLOCK, THREADS, raster_kernel
 
 
 @dataclass
@@ -75,7 +75,7 @@ def forward(
     tilts = torch.empty((count, TILT_COLUMNS), device=device) if flat else None
     outlines = torch.empty((count, SPLAT_COLUMNS), device=device) if flat else splats
     view = torch.from_numpy(view_of(camera, flat)).to(device, non_blocking=True)
-    kernel("project", FLAT=flat, COEFFICIENTS=g.sh.shape[1]).for_each(
+    raster_kernel("project", FLAT=flat, COEFFICIENTS=g.sh.shape[1]).for_each(
         count, g.means, g.quats, g.scales, g.opacities, g.sh, view, count, width, height, splats, tilts,
         outlines if flat else None,
     )  # fmt: skip
@@ -91,7 +91,7 @@ def forward(
     label_probability, depth, median = planes(labels is not None), planes(want_depth), planes(want_median)
     normals, moments = planes(want_normals, 3), planes(want_moments, 2)
     isect_counts = torch.empty(columns * lines, dtype=torch.int32, device=device)
-    blend = kernel(
+    blend = raster_kernel(
         "blend", FLAT=flat, LABELS=labels is not None, DEPTHS=want_depth, MEDIAN=want_median, NORMALS=want_normals,
         MOMENTS=want_moments,
     )  # fmt: skip
@@ -130,7 +130,7 @@ def backward(
     with_normals = frame.normals is not None and g_normals is not None
     columns_of_row = gradient_columns(flat, with_normals)
     row = GRADIENT_COLUMNS * (2 if with_normals else 1)
-    blend_backward = kernel(
+    blend_backward = raster_kernel(
         "blend_backward", FLAT=flat, LABELS=labels is not None, DEPTHS=frame.depth is not None and g_depth is not None,
         NORMALS=with_normals, MOMENTS=frame.moments is not None and g_moments is not None, COLUMNS=columns_of_row,
         ROW=row,
@@ -150,7 +150,7 @@ def backward(
         torch.empty_like(g.opacities), torch.empty_like(g.sh), g.ids.new_empty(0),
     )  # fmt: skip
     frame.screen_gradient = g.means.new_empty((count, 2))
-    kernel(
+    raster_kernel(
         "project_backward", FLAT=flat, COEFFICIENTS=g.sh.shape[1], NORMALS=with_normals, COLUMNS=columns_of_row, ROW=row
     )(
         -(-count // SPLATS_PER_BLOCK), SPLATS_PER_BLOCK, g.means, g.quats, g.scales, g.opacities, g.sh, frame.view,

@@ -189,12 +189,6 @@ def _label_loss(label_probability, labels, floor, scale, g_label_probability):
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, color, alpha, label_probability, background, target, labels, ssim_weight, semantic_weight):
-        if devices.on_gpu(color):
-            loss, ctx.gradients = losses_on_gpu.image_loss(
-                color, alpha, label_probability, background, target, labels, ssim_weight, semantic_weight, _WINDOW,
-                PROBABILITY_FLOOR,
-            )  # fmt: skip
-            return loss
         arrays = [t.detach().numpy() for t in (color, alpha, background)]
         shown = target.numpy()
         image = np.empty_like(shown)
@@ -422,4 +416,7 @@ def image_loss(
     Returns:
         () float32.
     """
-    return _ImageLoss.apply(color, alpha, label_probability, background, target, labels, ssim_weight, semantic_weight)
+    arguments = (color, alpha, label_probability, background, target, labels, ssim_weight, semantic_weight)
+    if devices.on_gpu(color):
+        return losses_on_gpu.image_loss(*arguments, _WINDOW, PROBABILITY_FLOOR)
+    return _ImageLoss.apply(*arguments)

@@ -1,13 +1,66 @@
-"""The losses of `on_cpu` as torch operations with the same values and gradients, without synchronization."""
+"""The losses of `on_cpu` as GPU kernels with the same values and gradients, without synchronization."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import numpy as np
 import torch
 
-from ...raster import devices
+from ...gpu.kernel import kernel
 
-Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor | None, torch.Tensor]
+_TILE, _BLOCK = 16, 256
+"""Width and height in pixels of the tile that a block of the image loss processes; threads per block of other sums."""
+
+
+class _ImageLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        color: torch.Tensor,
+        alpha: torch.Tensor,
+        label_probability: torch.Tensor | None,
+        background: torch.Tensor,
+        target: torch.Tensor,
+        labels: torch.Tensor | None,
+        ssim_weight: float,
+        semantic_weight: float,
+        more_labels: torch.Tensor | None,
+        window: np.ndarray,
+        floor: float,
+    ) -> torch.Tensor:
+        if label_probability is None:
+            labels = None
+        height, width = alpha.shape
+        blocks = math.ceil(width / _TILE) * math.ceil(height / _TILE)
+        has_ssim = ssim_weight > 0
+        taps = f"{{{', '.join(f'{float(tap)!r}f' for tap in window)}}}"
+        ctx.variant = {"SSIM": has_ssim, "WINDOW": taps, "FLOOR": floor}
+        planes = color.new_empty((9, height, width)) if has_ssim else None
+        sums, result = color.new_empty((blocks, 4)), color.new_empty(2)
+        images = (color.contiguous(), alpha, label_probability, background.contiguous(), target, labels)
+        kernel("image_loss", **ctx.variant)(blocks, _TILE**2, *images, width, height, planes, sums)
+        kernel("image_loss_total", SSIM=has_ssim)(
+            1, _BLOCK, sums, blocks, 3 * height * width, ssim_weight, semantic_weight, more_labels, result
+        )
+        ctx.save = (images, planes, result, ssim_weight, semantic_weight, more_labels, blocks)
+        return result[0]
+
+    @staticmethod
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        images, planes, result, ssim_weight, semantic_weight, more_labels, blocks = ctx.save
+        color, alpha, _, background, _, labels = images
+        height, width = alpha.shape
+        g_color, g_alpha, g_background = torch.empty_like(color), torch.empty_like(alpha), torch.empty_like(background)
+        g_label_probability = None if labels is None else torch.empty_like(alpha)
+        sums = color.new_empty((blocks, 3))
+        kernel("image_loss_backward", **ctx.variant)(
+            blocks, _TILE**2, *images, planes, result, g.contiguous(), width, height, ssim_weight, semantic_weight,
+            more_labels, g_color, g_alpha, g_label_probability, sums,
+        )  # fmt: skip
+        kernel("totals")(3, _BLOCK, sums, blocks, 3, 1.0, g_background)
+        return g_color, g_alpha, g_label_probability, g_background, *[None] * 7
 
 
 def image_loss(
@@ -21,66 +74,75 @@ def image_loss(
     semantic_weight: float | torch.Tensor,
     window: np.ndarray,
     floor: float,
-) -> tuple[torch.Tensor, Gradients]:
-    """Compute `on_cpu.image_loss` and its gradients with respect to color, alpha, label_probability and background.
+) -> torch.Tensor:
+    """Compute `on_cpu.image_loss`, differentiable in color, alpha, label_probability and background.
 
     window: (11,) float32, the window of SSIM; floor: added to the probability in the logarithm.
     """
-    behind = background[:, None, None]
-    image = color + (1 - alpha) * behind
-    difference = image - target
-    loss = (1 - ssim_weight) * difference.abs().mean()
-    g_image = difference.sign().mul_((1 - ssim_weight) / difference.numel())
-    if ssim_weight:
-        ssim, g_ssim = ssim_and_gradient(image, target, window)
-        loss = loss + ssim_weight * (1 - ssim)
-        g_image.sub_(g_ssim, alpha=ssim_weight)
-    g_label_probability = None
-    if label_probability is not None and labels is not None:
-        labeled = labels >= 0
-        count = labeled.sum().clamp(min=1)
-        semantic = torch.where(labeled, -torch.log((label_probability + floor) / (1 + floor)), 0.0).sum() / count
-        loss = loss + semantic_weight * semantic
-        g_label_probability = torch.where(labeled, -semantic_weight / (count * (label_probability + floor)), 0.0)
-    return loss, (g_image, -(g_image * behind).sum(0), g_label_probability, (g_image * (1 - alpha)).sum((1, 2)))
+    weight, more_labels = 1.0, None
+    if isinstance(semantic_weight, torch.Tensor):
+        more_labels = semantic_weight.detach()
+    else:
+        weight = semantic_weight
+    return _ImageLoss.apply(
+        color, alpha, label_probability, background, target, labels, ssim_weight, weight, more_labels, window, floor
+    )
 
 
-def ssim_and_gradient(
-    image: torch.Tensor, target: torch.Tensor, window: np.ndarray
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute the mean SSIM of image and target (3, H, W), and its gradient (3, H, W) with respect to the image."""
-    taps = devices.upload(window, image)
-    moments = torch.stack([image, target, image * image, target * target, image * target])
-    mu1, mu2, square1, square2, product = _blur(moments, taps)
-    s11, s22, s12 = square1 - mu1 * mu1, square2 - mu2 * mu2, product - mu1 * mu2
-    c1, c2 = 0.01**2, 0.03**2
-    a, b = 2 * mu1 * mu2 + c1, 2 * s12 + c2
-    over_d, over_e = 1 / (mu1 * mu1 + mu2 * mu2 + c1), 1 / (s11 + s22 + c2)
-    value = a * b * over_d * over_e
-    # Gradients with respect to the blurred square of the image and the blurred product with the target.
-    g_square = -value * over_e
-    g_product = 2 * a * over_d * over_e
-    g_mean = 2 * over_d * (mu2 * b * over_e - mu1 * value) - 2 * mu1 * g_square - mu2 * g_product
-    back = _blur(torch.stack([g_mean, g_square, g_product]) / image.numel(), taps)
-    return value.mean(), back[0] + 2 * image * back[1] + target * back[2]
+class _VolumeLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: torch.Tensor, flat: bool, valid: torch.Tensor | None) -> torch.Tensor:
+        blocks = math.ceil(len(scales) / _BLOCK)
+        sums, mean = scales.new_empty((blocks, 2)), scales.new_empty(2)
+        kernel("volume", FLAT=flat)(blocks, _BLOCK, scales, valid, len(scales), sums)
+        kernel("volume_mean")(1, _BLOCK, sums, blocks, mean)
+        ctx.save = scales, flat, valid, mean
+        return mean[0]
 
-
-def _blur(planes: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
-    """Convolve planes (n, 3, H, W) with the window along rows and columns, with zero padding."""
-    n, channels, height, width = planes.shape
-    count, radius = n * channels, len(taps) // 2
-    # A depthwise convolution uses torch's own kernel in full float32; variances are small differences of large numbers.
-    across = taps.view(1, 1, 1, -1).expand(count, 1, 1, -1)
-    down = taps.view(1, 1, -1, 1).expand(count, 1, -1, 1)
-    out = torch.conv2d(planes.view(1, count, height, width), across, padding=(0, radius), groups=count)
-    return torch.conv2d(out, down, padding=(radius, 0), groups=count).view(planes.shape)
+    @staticmethod
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        scales, flat, valid, mean = ctx.save
+        g_scales = torch.empty_like(scales)
+        kernel("volume_backward", FLAT=flat).for_each(
+            len(scales), scales, valid, mean, g.contiguous(), len(scales), g_scales
+        )
+        return g_scales, None, None
 
 
 def volume_loss(scales: torch.Tensor, flat: bool, valid: torch.Tensor | None) -> torch.Tensor:
     """Compute `on_cpu.volume_loss`, differentiable in scales."""
-    a, b, c = scales.unbind(1)
-    size = a * b if flat else a * b * c
-    return size.mean() if valid is None else torch.where(valid, size, 0.0).sum() / valid.sum().clamp(min=1)
+    return _VolumeLoss.apply(scales.contiguous(), flat, valid)
+
+
+class _NormalLoss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, normals: torch.Tensor, depth: torch.Tensor, alpha: torch.Tensor, intrinsics: np.ndarray,
+        solid: float, grazing: float,
+    ) -> torch.Tensor:  # fmt: skip
+        height, width = alpha.shape
+        blocks = math.ceil(height * width / _BLOCK)
+        camera = (*(float(value) for value in intrinsics), width, height)
+        partial, sums, mean = alpha.new_empty((9, height, width)), alpha.new_empty(blocks), alpha.new_empty(1)
+        kernel("normal_loss", SOLID=solid, GRAZING=grazing)(
+            blocks, _BLOCK, normals, depth, alpha, *camera, partial, sums
+        )
+        kernel("totals")(1, _BLOCK, sums, blocks, 1, 1 / (height * width), mean)
+        ctx.save = depth, alpha, partial, camera
+        return mean[0]
+
+    @staticmethod
+    def backward(ctx: Any, g: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        depth, alpha, partial, camera = ctx.save
+        g_normals, g_depth, g_alpha = (
+            alpha.new_empty((3, *alpha.shape)),
+            torch.empty_like(depth),
+            torch.empty_like(alpha),
+        )
+        kernel("normal_loss_backward").for_each(
+            alpha.numel(), depth, alpha, partial, g.contiguous(), *camera, g_normals, g_depth, g_alpha
+        )
+        return g_normals, g_depth, g_alpha, None, None, None
 
 
 def normal_loss(
@@ -95,27 +157,4 @@ def normal_loss(
 
     solid: smallest alpha of a pixel with a depth; grazing: smallest cosine between ray and normal.
     """
-    height, width = alpha.shape
-    if height < 3 or width < 3:
-        return 0.0 * (normals.sum() + depth.sum() + alpha.sum())
-    fx, fy, cx, cy = (float(v) for v in intrinsics)
-    rx = (torch.arange(1, width - 1, device=alpha.device) + (0.5 - cx)) / fx
-    ry = ((torch.arange(1, height - 1, device=alpha.device) + (0.5 - cy)) / fy)[:, None]
-    drawn = alpha > 0
-    z = torch.where(drawn, depth / torch.where(drawn, alpha, 1.0), 0.0)
-    left, right, above, below = z[1:-1, :-2], z[1:-1, 2:], z[:-2, 1:-1], z[2:, 1:-1]
-    az, bz = right - left, below - above
-    ax, ay = rx * az + (right + left) / fx, ry * az
-    bx, by = rx * bz, ry * bz + (below + above) / fy
-    nx, ny, nz = by * az - ay * bz, ax * bz - bx * az, ay * bx - ax * by
-    square = nx * nx + ny * ny + nz * nz
-    length = torch.where(square > 0, square, 1.0).sqrt()
-    nx, ny, nz = nx / length, ny / length, nz / length
-    middle = alpha[1:-1, 1:-1]
-    least = torch.minimum(
-        torch.minimum(alpha[1:-1, :-2], alpha[1:-1, 2:]), torch.minimum(alpha[:-2, 1:-1], alpha[2:, 1:-1])
-    )
-    faces = -(nx * rx + ny * ry + nz) > grazing * (rx * rx + ry * ry + 1.0).sqrt()
-    counted = (torch.minimum(least, middle) > solid) & (square > 0) & faces
-    mx, my, mz = normals[:, 1:-1, 1:-1]
-    return torch.where(counted, middle - (mx * nx + my * ny + mz * nz), 0.0).sum() / (height * width)
+    return _NormalLoss.apply(normals, depth, alpha, intrinsics, solid, grazing)

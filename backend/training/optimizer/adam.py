@@ -6,10 +6,14 @@ number of visible anchors instead of all anchors.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numba import prange
 
+from ...gpu.kernel import WARP
+from ...gpu.kernel import kernel as gpu_kernel
 from ...raster import devices
 from ...raster.kernel import kernel
 
@@ -20,8 +24,8 @@ EPSILON = 1e-15
 LARGEST_GRADIENT = 1e19
 """Gradients above this limit are rejected, since their square would overflow exp_avg_sq and freeze the parameter."""
 
-_ROWS_AT_ONCE = 100_000
-"""Number of rows per batch on the GPU, since intermediate results take five times the memory of the rows."""
+_ROWS_PER_BLOCK = 4
+"""Number of rows that a block of the GPU's kernel updates, each by a warp."""
 
 
 def step_rows(
@@ -54,38 +58,12 @@ def step_rows(
         arrays = (t.numpy() for t in (values, exp_avg, exp_avg_sq, seen, gradients))
         return torch.tensor(_step_rows(*arrays, rates, correction1, correction2))
     bad = torch.zeros((), dtype=torch.int64, device=values.device)
-    steps = devices.upload(rates, values)
-    for start in range(0, len(seen), _ROWS_AT_ONCE):
-        part = slice(start, start + _ROWS_AT_ONCE)
-        bad += _step_rows_on_gpu(
-            values, exp_avg, exp_avg_sq, seen[part], gradients[part], steps, correction1, correction2,
-            None if usable is None else usable[part],
-        )  # fmt: skip
+    constants = {"BETA1": BETA1, "BETA2": BETA2, "EPSILON": EPSILON, "LARGEST_GRADIENT": LARGEST_GRADIENT}
+    gpu_kernel("step_rows", ROWS_PER_BLOCK=_ROWS_PER_BLOCK, **constants)(
+        math.ceil(len(seen) / _ROWS_PER_BLOCK), _ROWS_PER_BLOCK * WARP, values, exp_avg, exp_avg_sq, seen, gradients,
+        usable, devices.upload(rates, values), 1 / correction1, 1 / correction2, len(seen), values.shape[1], bad,
+    )  # fmt: skip
     return bad
-
-
-def _step_rows_on_gpu(
-    values: torch.Tensor,
-    exp_avg: torch.Tensor,
-    exp_avg_sq: torch.Tensor,
-    seen: torch.Tensor,
-    gradients: torch.Tensor,
-    rates: torch.Tensor,
-    correction1: float,
-    correction2: float,
-    usable: torch.Tensor | None,
-) -> torch.Tensor:
-    finite = gradients.abs().amax(1) < LARGEST_GRADIENT
-    counted = torch.ones_like(finite) if usable is None else usable
-    stepped = (finite & counted)[:, None]
-    old_value, old_exp_avg, old_exp_avg_sq = values[seen], exp_avg[seen], exp_avg_sq[seen]
-    new_exp_avg = torch.lerp(gradients, old_exp_avg, BETA1)
-    new_exp_avg_sq = (BETA2 * old_exp_avg_sq).addcmul_(gradients, gradients, value=1 - BETA2)
-    change = (new_exp_avg / correction1).div_((new_exp_avg_sq / correction2).sqrt_().add_(EPSILON)).mul_(rates)
-    values.index_copy_(0, seen, torch.where(stepped, old_value - change, old_value))
-    exp_avg.index_copy_(0, seen, torch.where(stepped, new_exp_avg, old_exp_avg))
-    exp_avg_sq.index_copy_(0, seen, torch.where(stepped, new_exp_avg_sq, old_exp_avg_sq))
-    return (counted & ~finite).sum()
 
 
 @kernel(parallel=True)

@@ -4,6 +4,7 @@
 //                          blocks shall fit on a multiprocessor.
 // DEVICE                   begins a function that is inlined into kernels.
 // SHARED(type, name, dims) declares an array in the shared memory of a block, aligned to 16 bytes.
+// largest_in_block(p, x)   sets *p to x if that is larger, for all threads; count_up(p) adds 1 to *p.
 // any_in_warp(condition)   is false only if the condition holds in no thread of the warp.
 #ifndef PLATFORM_H
 #define PLATFORM_H
@@ -27,6 +28,7 @@
 DEVICE void sync_block() { __syncthreads(); }
 DEVICE bool any_in_block(bool condition) { return __syncthreads_or(condition); }
 DEVICE void largest_in_block(int *place, int value) { atomicMax(place, value); }
+DEVICE void count_up(long long *number) { atomicAdd((unsigned long long *)number, 1ULL); }
 DEVICE int bits_of(float x) { return __float_as_int(x); }
 
 #if defined(__HIP_PLATFORM_AMD__) || defined(__HIP__)

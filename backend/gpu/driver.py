@@ -19,7 +19,7 @@ import numba
 import torch
 from torch.cuda import _utils as libraries
 
-from ...shared.formats.atomic import write_atomic
+from ..shared.formats.atomic import write_atomic
 
 
 def load(name: str, source: str) -> Callable[[Any, int, int], None]:

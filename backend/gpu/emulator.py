@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import os
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -15,11 +16,16 @@ from typing import Any
 
 import numba
 
-from ...shared.formats.atomic import atomic_path
+from ..shared.formats.atomic import atomic_path
 
 _COMMAND = (
     "g++", "-std=c++17", "-O2", "-fPIC", "-shared", "-w", "-x", "c++", "-ffp-contract=off", "-U_FORTIFY_SOURCE",
 )  # fmt: skip
+
+
+def emulated() -> bool:
+    """Return whether a GPU is emulated on the CPU, for tests."""
+    return os.environ.get("OBJECTGS_EMULATE_GPU") == "1"
 
 
 def load(name: str, source: str) -> Callable[[Any, int, int], None]:

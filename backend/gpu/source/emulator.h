@@ -151,6 +151,7 @@ DEVICE bool any_in_warp(bool condition) {
     return emulator::current->vote;
 }
 DEVICE void largest_in_block(int *place, int value) { *place = *place < value ? value : *place; }
+DEVICE void count_up(long long *number) { ++*number; }
 DEVICE float reciprocal(float x) { return 1.0f / x; }
 DEVICE int bits_of(float x) {
     int bits;
