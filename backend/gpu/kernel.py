@@ -28,8 +28,8 @@ WARP = 32
 _FOR_EACH = 128
 """Number of threads per block of kernels without shared memory."""
 _TYPES = {
-    "bool": torch.bool, "float": torch.float32, "double": torch.float64, "short": torch.int16, "int": torch.int32,
-    "long long": torch.int64,
+    "bool": torch.bool, "float": torch.float32, "double": torch.float64, "unsigned char": torch.uint8,
+    "signed char": torch.int8, "short": torch.int16, "int": torch.int32, "long long": torch.int64,
 }  # fmt: skip
 _INCLUDE = re.compile(r'^#include "(.+)"$', re.MULTILINE)
 _PARAMETERS = re.compile(r"^KERNEL\(.*?\) \w+\((.*?)\) \{", re.MULTILINE | re.DOTALL)

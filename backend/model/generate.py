@@ -96,6 +96,7 @@ class _GenerateOnGpu(torch.autograd.Function):
         ctx.layout, ctx.parameters = layout, parameters
         ctx.save = rows, inputs, hidden, scales, opacities, valid
         ctx.mark_non_differentiable(of_splats, valid)
+        ctx.set_materialize_grads(False)
         return means, quats, scales, opacities, sh, of_splats, valid
 
     @staticmethod
@@ -103,16 +104,19 @@ class _GenerateOnGpu(torch.autograd.Function):
         rows, inputs, hidden, scales, opacities, valid = ctx.save
         layout, k = ctx.layout, ctx.layout.offsets
         weights, biases = ctx.parameters[::2], ctx.parameters[1::2]
+        of_splats = [None if g is None else g.contiguous() for g in gradients[:5]]
         g_rows = torch.empty_like(rows)
         g_outputs = [rows.new_empty((len(rows), len(bias))) for bias in biases[1:]]
         threads = max(_THREADS, WARP * math.ceil(k / WARP))
         kernel("generate_backward", THREADS_OF_GENERATE=threads, **ctx.constants)(
             math.ceil(len(rows) / (threads // k)), threads, rows, scales, opacities, valid,
-            *(g.contiguous() for g in gradients[:5]), len(rows), g_rows, *g_outputs,
+            *of_splats, len(rows), g_rows, *g_outputs,
         )  # fmt: skip
-        g_hidden = torch.cat([g @ weight for g, weight in zip(g_outputs, weights[1:], strict=True)], 1)
-        g_hidden = torch.where(hidden > 0, g_hidden, 0.0)
-        g_rows[:, layout.feature_columns] = g_hidden @ weights[0][:, : layout.features]
+        g_hidden = torch.empty_like(hidden)
+        for g, weight, part in zip(g_outputs, weights[1:], g_hidden.split(HIDDEN, 1), strict=True):
+            torch.mm(g, weight, out=part)
+        g_hidden = torch.ops.aten.threshold_backward(g_hidden, hidden, 0.0)
+        torch.mm(g_hidden, weights[0][:, : layout.features], out=g_rows[:, layout.feature_columns])
         pairs = zip((g_hidden, *g_outputs), (inputs, *hidden.split(HIDDEN, 1)), strict=True)
         of_parameters = itertools.chain.from_iterable((g.T @ x, g.sum(0)) for g, x in pairs)
         return (None, g_rows, None, None, None, None, *of_parameters)

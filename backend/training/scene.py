@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from ..gpu.kernel import kernel
 from ..model.object_model import Normalization
 from ..raster import Camera, devices
 from ..shared.class_table import ClassTable
@@ -103,8 +104,17 @@ class Scene:
             InputError: the image or mask cannot be read.
         """
         pixels, labels = self._stored(index, downscale)
-        scale = devices.upload((1 / (255 * self.gains[index])).astype(np.float32), pixels)
-        return pixels.float() * scale[:, None, None], None if labels is None else labels.int()
+        scale = (1 / (255 * self.gains[index])).astype(np.float32)
+        if not devices.on_gpu(pixels):
+            factor = torch.from_numpy(scale)[:, None, None]
+            return pixels.float() * factor, None if labels is None else labels.int()
+        _, height, width = pixels.shape
+        image = torch.empty(pixels.shape, device=pixels.device)
+        wanted = None if labels is None else torch.empty((height, width), dtype=torch.int32, device=pixels.device)
+        kernel("load_target", LABEL="int" if labels is None else _LABELS[labels.dtype]).for_each(
+            height * width, pixels, labels, *scale.tolist(), height * width, image, wanted
+        )
+        return image, wanted
 
     def _stored(self, index: int, downscale: int) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Return a view's image (3, H, W) uint8 and labels in few bytes, a quarter of the size of a target."""
@@ -142,6 +152,10 @@ class Scene:
         if not self.supervise_background:
             classes[mask == 0] = -1
         return classes.astype(np.min_scalar_type(-1 - len(self.classes)))
+
+
+_LABELS = {torch.int8: "signed char", torch.int16: "short", torch.int32: "int"}
+"""Types in which labels are stored, and their names in kernels."""
 
 
 def _size(image: torch.Tensor, labels: torch.Tensor | None) -> int:

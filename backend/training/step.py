@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from ..gpu.kernel import kernel
 from ..model.anchors import Anchors
 from ..model.generate import Generated, generate
 from ..model.object_model import ObjectModel, anchors_in_view, first_anchors_in_view
@@ -74,7 +75,7 @@ class ViewGradients(NamedTuple):
 
     Attributes:
         camera: camera of the view.
-        loss: () loss.
+        loss: () loss; NaN if it is not finite or no anchor is in view.
         seen: (n,) int64, the anchors in view.
         rows: (n, columns), copies of their rows, with gradients.
         finite: () bool, on the GPU: whether the loss is finite and any anchor is in view.
@@ -253,11 +254,11 @@ class ViewStep:
         downscale = downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
         image, labels = self.scene.target(index, downscale)
         camera = self.scene.camera(index, downscale)
-        present = None
+        present = in_view = None
         if on_gpu and self.parts == 1:
             limit = self._limits.of(index, len(anchors))
-            seen, present, count = first_anchors_in_view(anchors, *frustum(camera), limit)
-            self._limits.note(index, count, len(anchors))
+            seen, present, in_view = first_anchors_in_view(anchors, *frustum(camera), limit)
+            self._limits.note(index, in_view, len(anchors))
         else:
             seen = anchors_in_view(anchors, *frustum(camera))
         if len(seen) == 0:
@@ -265,9 +266,7 @@ class ViewStep:
         self._head_optimizer.zero_grad()
         rows = take_rows(anchors.rows, seen).requires_grad_()
         correction = None if self.colors is None else self.colors.of(index)
-        loss = torch.zeros((), device=rows.device)
-        self._splats = 0
-        statistics = []
+        losses, splats, statistics = [], [], []
         for part in self._parts_of(camera, image, labels):
             chosen = self._anchors_of(part, seen, rows)
             terms, g, drawn = self._terms(part, *chosen, present, correction, progress)
@@ -278,8 +277,8 @@ class ViewStep:
                 self._check.fault = check_finite.find_fault_of_loss(named, g, chosen[0], anchors.layout.offsets)
                 return None
             of_part.backward()
-            loss = loss + of_part.detach()
-            self._splats = self._splats + (len(g.source) if g.valid is None else g.valid.sum())
+            losses.append(of_part.detach())
+            splats.append(len(g.source) if g.valid is None else g.valid.sum())
             if self._growth.observes(progress) and drawn.frame.screen_gradient is not None:
                 statistics.append(
                     ViewStatistics(
@@ -288,10 +287,15 @@ class ViewStep:
                 )
         if self.colors is not None and correction is not None and correction.grad is not None:
             self.colors.step(index, correction.grad, progress)
+        loss, self._splats = sum(losses[1:], start=losses[0]), sum(splats[1:], start=splats[0])
         finite = usable = None
-        if on_gpu:
-            finite = loss.isfinite() if present is None else loss.isfinite() & present.any()
-            usable = finite.repeat(len(seen)) if present is None else finite & present
+        if present is not None:
+            usable, finite, shown = torch.empty_like(present), present.new_empty(()), torch.empty_like(loss)
+            kernel("find_usable").for_each(len(seen), loss, present, in_view, len(seen), usable, finite, shown)
+            loss = shown
+        elif on_gpu:
+            finite = loss.isfinite()
+            usable, loss = finite.repeat(len(seen)), torch.where(finite, loss, math.nan)
         return ViewGradients(camera, loss, seen, rows, finite, usable, statistics)
 
     def _parts_of(self, camera: Camera, image: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:

@@ -354,11 +354,12 @@ class Trainer:
         # Remove the view only now, so that it remains the next one if its image cannot be read.
         index = p.queue.pop()
         p.step += 1
-        loss = torch.full((), math.nan, device=self.model.device)
-        if gradients is not None:
+        if gradients is None:
+            loss = torch.full((), math.nan, device=self.model.device)
+        else:
+            loss = gradients.loss
             self._update(gradients, progress)
             self._average.follow(self.model, p.step)
-            loss = gradients.loss if gradients.finite is None else torch.where(gradients.finite, gradients.loss, loss)
         before = len(self.model.anchors)
         if (fault := self._check.take_fault()) is not None:
             self._handle(fault, index)
@@ -392,15 +393,14 @@ class Trainer:
     def _update(self, gradients: ViewGradients, progress: float) -> None:
         step, optimizer = self.progress.step, self._head_optimizer
         of_heads = {
-            name: [parameter.grad.flatten() for parameter in group if parameter.grad is not None]
+            name: [parameter.grad for parameter in group if parameter.grad is not None]
             for name, group in optimizer.groups.items()
         }
-        finite = torch.cat([part for parts in of_heads.values() for part in parts]).isfinite().all()
-        if gradients.finite is not None:
-            finite = finite & gradients.finite
-        optimizer.step({name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, (~finite).float())
+        updated = optimizer.step(
+            {name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, gradients.finite
+        )
         assert gradients.rows.grad is not None
-        skipped = ~finite + step_rows(
+        skipped = ~updated + step_rows(
             self.model.anchors.rows, self._exp_avg, self._exp_avg_sq, gradients.seen, gradients.rows.grad,
             row_rates(self.settings, progress), 1 - BETA1**step, 1 - BETA2**step, gradients.usable,
         )  # fmt: skip

@@ -35,7 +35,7 @@ def set_gradients(groups, step):
 def stepped(optimizer, groups, steps, skipping=()):
     for step in steps:
         set_gradients(groups, step)
-        optimizer.step(rates(step), torch.tensor(float(step in skipping)))
+        optimizer.step(rates(step), torch.tensor(step not in skipping))
     return [parameter.detach().clone() for group in groups.values() for parameter in group]
 
 
@@ -55,6 +55,28 @@ def test_steps_are_those_of_torch(skipping):
         adam.step()
     for a, b in zip(found, (parameter for group in theirs.values() for parameter in group), strict=True):
         assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("infinite", [False, True])
+def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(monkeypatch, infinite):
+    """A step with a gradient or a loss that is not finite changes nothing."""
+    found = []
+    for emulate in ("0", "1"):
+        monkeypatch.setenv("OBJECTGS_EMULATE_GPU", emulate)
+        groups = parameters()
+        optimizer = HeadAdam(groups)
+        stepped(optimizer, groups, range(5), (1,))
+        set_gradients(groups, 6)
+        if infinite:
+            groups["color"][0].grad[1, 1] = torch.inf
+        updated = optimizer.step(rates(6), torch.tensor(True))
+        assert bool(updated) != infinite
+        found.append(
+            {**optimizer.tensors(), **{f"{n}{i}": p.detach() for n, g in groups.items() for i, p in enumerate(g)}}
+        )
+    assert found[0].keys() == found[1].keys()
+    for name, value in found[0].items():
+        torch.testing.assert_close(found[1][name], value, rtol=1e-5, atol=1e-7, msg=name)
 
 
 def test_restored_state_goes_on_as_before():

@@ -11,10 +11,18 @@ import numpy as np
 import torch
 from torch.optim.adam import adam
 
+from ...gpu.kernel import kernel
+from ...raster import devices
 from .adam import BETA1, BETA2, EPSILON
 
 MOMENTS, STEP = ("exp_avg", "exp_avg_sq"), "step"
 """Names of the state of a parameter: tensors of its shape, and the number of steps."""
+
+
+_TABLE_COLUMNS = 7
+"""Of the GPU kernels' table of tensors (tensors.h)."""
+_CHECKED_BY, _BLOCKS, _THREADS = 1024, 8, 256
+"""Number of threads that check all gradients on a GPU; blocks that update a tensor, and their threads."""
 
 
 class HeadAdam:
@@ -40,26 +48,38 @@ class HeadAdam:
             parameter.grad = None
 
     @torch.no_grad()
-    def step(self, rates: Mapping[str, float], skipped: torch.Tensor) -> None:
-        """Update the parameters that have gradients, in place.
+    def step(self, rates: Mapping[str, float], finite: torch.Tensor | None = None) -> torch.Tensor:
+        """Update the parameters that have gradients, in place, if all gradients are finite.
 
         Args:
             rates: The learning rate of each group.
-            skipped: () float32; where it is not 0, nothing changes. It is read on the device, without synchronization.
+            finite: () bool; where it is False, nothing changes. It is read on the device, without synchronization.
+
+        Returns:
+            () bool, on the device: whether the parameters were updated.
         """
-        for name, numbers in self._numbers.items():
-            stepped = [i for i in numbers if self._parameters[i].grad is not None]
-            states = [self._state(i) for i in stepped]
-            if stepped:
+        stepped = {
+            name: [i for i in numbers if self._parameters[i].grad is not None]
+            for name, numbers in self._numbers.items()
+        }
+        if devices.on_gpu(self._parameters[0]):
+            return self._step_on_gpu([(i, rates[name]) for name, numbers in stepped.items() for i in numbers], finite)
+        every = [gradient.flatten() for parameter in self._parameters if (gradient := parameter.grad) is not None]
+        usable = torch.cat(every).isfinite().all()
+        if finite is not None:
+            usable = usable & finite
+        for name, numbers in stepped.items():
+            states = [self._state(i) for i in numbers]
+            if numbers:
                 adam(
-                    [self._parameters[i] for i in stepped],
-                    [gradient for i in stepped if (gradient := self._parameters[i].grad) is not None],
+                    [self._parameters[i] for i in numbers],
+                    [gradient for i in numbers if (gradient := self._parameters[i].grad) is not None],
                     [state["exp_avg"] for state in states],
                     [state["exp_avg_sq"] for state in states],
                     [],
                     [state["step"] for state in states],
                     fused=True,
-                    found_inf=skipped,
+                    found_inf=(~usable).float(),
                     amsgrad=False,
                     beta1=BETA1,
                     beta2=BETA2,
@@ -68,6 +88,27 @@ class HeadAdam:
                     eps=EPSILON,
                     maximize=False,
                 )
+        return usable
+
+    def _step_on_gpu(self, stepped: Sequence[tuple[int, float]], finite: torch.Tensor | None) -> torch.Tensor:
+        """Implement `step` for the parameters with these numbers and learning rates."""
+        device = self._parameters[0].device
+        table = np.zeros((len(stepped), _TABLE_COLUMNS), np.int64)
+        gradients = []
+        for row, (i, rate) in zip(table, stepped, strict=True):
+            parameter, state = self._parameters[i], self._state(i)
+            assert parameter.grad is not None
+            gradients.append(parameter.grad.contiguous())
+            tensors = (parameter, gradients[-1], state["exp_avg"], state["exp_avg_sq"], state[STEP])
+            row[:-1] = *(tensor.data_ptr() for tensor in tensors), parameter.numel()
+            row[-1:].view(np.float32)[0] = rate
+        rows = devices.upload(table, device)
+        usable = torch.empty((), dtype=torch.bool, device=device)
+        kernel("check_tensors")(1, _CHECKED_BY, rows, len(stepped), finite, usable)
+        kernel("step_tensors", BLOCKS_PER_TENSOR=_BLOCKS, BETA1=BETA1, BETA2=BETA2, EPSILON=EPSILON)(
+            len(stepped) * _BLOCKS, _THREADS, rows, usable
+        )
+        return usable
 
     def _state(self, number: int) -> dict[str, torch.Tensor]:
         if number not in self._states:

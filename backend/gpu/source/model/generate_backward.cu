@@ -1,5 +1,5 @@
 // Gradient of the generation: from those of the Gaussians to those of the rows, except for their features, and of the
-// outputs of the heads. A block processes ANCHORS_PER_BLOCK anchors, with a thread for each of their offsets.
+// outputs of the heads. Gradients that are not given are 0. A block processes ANCHORS_PER_BLOCK anchors, with a thread for each of their offsets.
 #include "generate.h"
 
 #define ANCHORS_PER_BLOCK (THREADS_OF_GENERATE / OFFSETS)
@@ -17,14 +17,14 @@ KERNEL(THREADS_OF_GENERATE, 1) generate_backward(
         float *g_row = g_rows + (size_t)a * ROW_COLUMNS;
         const bool made = valid[at];
         const float alpha = opacities[at];
-        const float g_raw = made ? g_opacities[at] * (1.0f - alpha * alpha) : 0.0f;
+        const float g_raw = made && g_opacities ? g_opacities[at] * (1.0f - alpha * alpha) : 0.0f;
         g_of_opacity[at] = g_row[AT_OPACITY + j] = g_raw;
         for (int i = 0; i < 3; i++) {
             const float offset_extent = row[AT_EXTENTS + i], scale_extent = row[AT_EXTENTS + 3 + i];
             const float extent = expf(offset_extent > (float)LOG_EXTENT_MAX ? (float)LOG_EXTENT_MAX : offset_extent);
             const float size = expf(scale_extent > (float)LOG_EXTENT_MAX ? (float)LOG_EXTENT_MAX : scale_extent);
-            const float g_mean = made ? g_means[3 * at + i] : 0.0f;
-            const float along = made ? g_scales[3 * at + i] * scales[3 * at + i] : 0.0f;
+            const float g_mean = made && g_means ? g_means[3 * at + i] : 0.0f;
+            const float along = made && g_scales ? g_scales[3 * at + i] * scales[3 * at + i] : 0.0f;
             // The clamp of the extents passes the gradient, so that one beyond the limit can return.
             g_row[3 * j + i] = g_mean * extent;
             of_extents[THREAD][i] = g_mean * row[3 * j + i] * extent;
@@ -33,9 +33,9 @@ KERNEL(THREADS_OF_GENERATE, 1) generate_backward(
             g_of_shape[7 * at + i] = g_row[AT_SHAPE + 7 * j + i] = g_size;
         }
         for (int i = 0; i < 4; i++)
-            g_of_shape[7 * at + 3 + i] = g_row[AT_SHAPE + 7 * j + 3 + i] = made ? g_quats[4 * at + i] : 0.0f;
+            g_of_shape[7 * at + 3 + i] = g_row[AT_SHAPE + 7 * j + 3 + i] = made && g_quats ? g_quats[4 * at + i] : 0.0f;
         for (int i = 0; i < 3 * COEFFICIENTS; i++) {
-            const float g = made ? g_sh[3 * COEFFICIENTS * at + i] : 0.0f;
+            const float g = made && g_sh ? g_sh[3 * COEFFICIENTS * at + i] : 0.0f;
             g_of_color[3 * COEFFICIENTS * at + i] = g;
             if (i < 3) g_row[AT_COLOR + 3 * j + i] = g;
         }
