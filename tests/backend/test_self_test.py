@@ -36,8 +36,8 @@ def test_everything_that_trainings_need_is_compared(expected):
     assert (expected["alpha of Gaussians"] > 0.3).mean() > 0.5 and (expected["alpha of Gaussians"] < 0.9).mean() > 0.1
 
 
-def test_a_device_that_computes_the_same_passes(tmp_path, monkeypatch, expected):
-    monkeypatch.setenv("OBJECTGS_EMULATE_GPU", "1")
+def test_a_device_that_computes_the_same_passes(tmp_path, emulate_gpu, expected):
+    emulate_gpu()
     found = results(devices.CPU, tmp_path / "files")
     assert any(not np.array_equal(found[name], right) for name, right in expected.items())
     assert difference(found, expected) == ""
