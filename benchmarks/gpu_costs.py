@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -51,6 +51,7 @@ from backend.labels import vote
 from backend.model.object_model import first_anchors_in_view
 from backend.raster.gpu import binning, renderer
 from backend.raster.gpu.kernels import TILE, raster_kernel
+from backend.raster.discs import SPOT
 from backend.raster.settings import ALPHA_MIN
 from backend.shared.events import Reporter
 from backend.training import step
@@ -71,9 +72,8 @@ CARDS = {
 multiprocessor of each issues four warp instructions a clock."""
 BLENDING = ("blend", "blend_backward")
 NAMES = {"3d": "Gaussians", "2d": "discs"}
-_EXPONENTIAL = "MUFU.EX2"
-"""Instruction that of all loops only that over splats has."""
 STEPS, SAMPLED_TILES = 40, 150
+WARP = kernels.WARP
 _EMPTY = "KERNEL(32, 1) empty({}) {{"
 _NO_LAUNCH = {
     "view", "_unsafe_view", "reshape", "expand", "slice", "select", "split", "unbind", "t", "transpose", "permute",
@@ -231,33 +231,47 @@ def large_step(primitive: str, scratch: Path) -> tuple[dict[str, Any], dict[str,
 
 
 def iterations(frame: renderer.Frame) -> dict[str, float]:
-    """Return how often a warp of the blending kernels visits a splat, and how often one that is drawn in a pixel of it.
+    """Return how often the warps of the blending kernels look at a splat ("visits"), draw it because it may be drawn in
+    their pixels ("candidates"), and find that it is drawn in one of them ("hits").
 
-    The latter is found in a sample of tiles, without the transmittance, so it is an upper bound.
+    The last two are found in a sample of tiles, and without the transmittance, so they are upper limits.
     """
-    counts = frame.isect_counts.numpy()
-    offsets = frame.intersections.isect_offsets.numpy()
-    columns = -(-frame.camera.width // TILE)
-    splats = frame.splats.numpy().astype(np.float64)
-    rng = np.random.default_rng(0)
-    visited = drawn = 0
-    for tile in rng.permutation(np.flatnonzero(counts))[:SAMPLED_TILES]:
-        rows = splats[frame.intersections.isect_ids[offsets[tile] : offsets[tile] + counts[tile]].numpy()]
+    counts, offsets = frame.isect_counts.numpy(), frame.intersections.isect_offsets.numpy()
+    across = -(-frame.camera.width // TILE)
+    splats = frame.splats.double().numpy()
+    tilts = None if frame.tilts is None else frame.tilts.double().numpy()
+    found = np.zeros(3)
+    for tile in np.random.default_rng(0).permutation(np.flatnonzero(counts))[:SAMPLED_TILES]:
+        n = frame.intersections.isect_ids[offsets[tile] : offsets[tile] + counts[tile]].numpy()
         y, x = np.mgrid[:TILE, :TILE] + 0.5
-        x, y = x + tile % columns * TILE, y + tile // columns * TILE
-        u, v, slope, a, c, lop = (rows[:, i, None, None] for i in range(6))
-        anchor = np.clip(v, 0, frame.camera.height)
-        d = x - (u + slope * (y - anchor))
-        inside = lop - c * (y - v) ** 2 - a * d * d >= np.log2(ALPHA_MIN)
-        # A warp draws 8x4 pixels.
-        drawn += inside.reshape(-1, 4, 4, 2, 8).any((2, 4)).sum()
-        visited += 8 * len(rows)
-    total = 8 * int(counts.sum())
-    return {"visits": total, "hits": total * drawn / max(visited, 1)}
+        x, y = x + tile % across * TILE, y + tile // across * TILE
+        u, v, slope, a, c, lop = (splats[n, i, None, None] for i in range(6))
+        reach, dy = lop - np.log2(ALPHA_MIN), y - v
+        along = y - np.clip(v, 0, frame.camera.height)
+        d = x - (u + slope * along)
+        fall, spot, q = a * d * d + c * dy * dy, np.inf, np.ones_like(d)
+        if tilts is not None:
+            q0, qx, qy, nearest, spot_u = (tilts[n, i, None, None] for i in range(5))
+            q = q0 + qy * along + qx * d
+            spot = SPOT * ((x - spot_u) ** 2 + dy * dy)
+            fall = np.where((q > 0) & (1 >= nearest * q), fall / np.where(q == 0, 1, q * q), np.inf)
+        drawn = np.minimum(fall, spot) <= reach
+        # Of a warp's 8x4 pixels: the bound of each row is that of its pixel nearest to the ridge.
+        rows = (len(n), 4, 4, 2, 8)
+        d, q = d.reshape(rows), np.abs(q.reshape(rows))
+        nearest_d = np.where((d[..., 0] <= 0) & (d[..., -1] >= 0), 0, np.minimum(abs(d[..., 0]), abs(d[..., -1])))
+        dy = np.broadcast_to(dy, (len(n), TILE, TILE)).reshape(rows)[..., 0]
+        bound = a[..., None, None] * nearest_d**2 + c[..., None, None] * dy**2
+        may = bound <= reach[..., None, None] * q.max(-1) ** 2
+        may |= np.broadcast_to(spot <= reach, drawn.shape).reshape(rows).any(-1)
+        found += 8 * len(n), may.any(2).sum(), drawn.reshape(rows).any((2, 4)).sum()
+    visits = 8 * int(counts.sum())
+    return {"visits": visits, "candidates": visits * found[1] / found[0], "hits": visits * found[2] / found[0]}
 
 
-def loops_of(text: str) -> list[list[str]]:
-    """Return the instructions of the innermost loops in a kernel's listing."""
+def loops_of(text: str) -> tuple[list[str], list[tuple[int, int]]]:
+    """Return the instructions in a kernel's listing, with "-> n" after a jump forward over the next n of them, and the
+    first and last + 1 instruction of each loop."""
     lines: list[str] = []
     labels: dict[str, int] = {}
     for line in text.splitlines():
@@ -268,35 +282,40 @@ def loops_of(text: str) -> list[list[str]]:
     spans = []
     for at, words in enumerate(lines):
         target = re.search(r"BRA.*`\((\.L_x_\d+)\)", words)
-        # A jump to itself ends the program.
-        if target and labels.get(target[1], at + 1) < at:
-            spans.append((labels[target[1]], at + 1))
-    inner = [s for s in spans if not any(o != s and s[0] <= o[0] and o[1] <= s[1] for o in spans)]
-    return [_with_jumps(lines[slice(*span)], labels, span) for span in inner]
-
-
-def _with_jumps(lines: list[str], labels: Mapping[str, int], span: tuple[int, int]) -> list[str]:
-    """Return a loop's instructions, with "-> n" after a jump forward over the next n of them."""
-    out = []
-    for at, words in enumerate(lines):
-        target = re.search(r"BRA.*`\((\.L_x_\d+)\)", words)
-        ahead = labels.get(target[1], 0) - span[0] - at - 1 if target else 0
-        out.append(f"{words} -> {ahead}" if 0 < ahead < len(lines) - at else words)
-    return out
+        to = labels.get(target[1], at) if target else at
+        if to > at:
+            lines[at] += f" -> {to - at - 1}"
+        elif to < at:
+            spans.append((to, at + 1))
+    return lines, spans
 
 
 def instructions_of_loops(text: str) -> dict[str, int]:
-    """Return the instructions of a blending kernel's iterations: of the loop over splats, where no pixel of the warp is
-    drawn ("missed") and where one is ("hit"), and of the loop over warps that sums up gradients ("summed")."""
-    loops = loops_of(text)
-    over_splats = max((loop for loop in loops if any(_EXPONENTIAL in words for words in loop)), key=len)
+    """Return the instructions of a blending kernel's iterations: of the loop in which a warp tests 32 splats ("tested"),
+    of that over candidates, where no pixel of the warp is drawn ("missed") and where one is ("hit"), and of the loop over
+    warps that sums up gradients ("summed")."""
+    lines, spans = loops_of(text)
+
+    def smallest(holds: Callable[[list[str]], bool]) -> tuple[int, int]:
+        return min((span for span in spans if holds(lines[slice(*span)])), key=lambda span: span[1] - span[0])
+
+    over_splats = smallest(lambda loop: any("MUFU.EX2" in words for words in loop))
+    tests = smallest(lambda loop: any(re.search(r"VOTE.ANY R\d+, PT", words) for words in loop))
+    nested = [over_splats] if tests[0] <= over_splats[0] and over_splats[1] <= tests[1] else []
+    body = lines[slice(*over_splats)]
     # The compiler may have unrolled the loop.
-    unrolled = sum(_EXPONENTIAL in words for words in over_splats)
-    jumps = sorted((int(words.rpartition("-> ")[2]) for words in over_splats if "-> " in words), reverse=True)
-    others = [len(loop) for loop in loops if loop is not over_splats and sum("FFMA" in words for words in loop) > 4]
+    unrolled = sum("MUFU.EX2" in words for words in body)
+    jumps = sorted((int(words.rpartition("-> ")[2]) for words in body if "-> " in words), reverse=True)
+    inner = [s for s in spans if not any(o != s and s[0] <= o[0] and o[1] <= s[1] for o in spans)]
+    others = [
+        end - begin
+        for begin, end in inner
+        if (begin, end) not in (over_splats, tests) and sum("FFMA" in words for words in lines[begin:end]) > 4
+    ]
     return {
-        "missed": round((len(over_splats) - sum(jumps[:unrolled])) / unrolled),
-        "hit": round(len(over_splats) / unrolled),
+        "tested": tests[1] - tests[0] - sum(end - begin for begin, end in nested),
+        "missed": round((len(body) - sum(jumps[:unrolled])) / unrolled),
+        "hit": round(len(body) / unrolled),
         "summed": max(others, default=0),
     }
 
@@ -388,7 +407,7 @@ def document(figures: Mapping[str, Any]) -> str:
         sizes.append(
             f"| {NAMES[primitive]} | {of['anchors']:,.0f} | {of['splats']:,.0f} | {of['drawn']:,.0f} | "
             f"{of['visits'] / 1e6:.0f} | "
-            f"{of['hits'] / of['visits']:.2f} | {(sum(of['bytes'].values()) + of['torch_bytes']) / 1e9:.2f} |"
+            f"{of['candidates'] / of['visits']:.2f} | {of['hits'] / of['visits']:.2f} | {(sum(of['bytes'].values()) + of['torch_bytes']) / 1e9:.2f} |"
         )
         for card, parts in figures["predicted"][primitive].items():
             cells = [f"{parts[part]:.2f}" for part in (*BLENDING, "other kernels", "torch", "step")]
@@ -408,19 +427,19 @@ one, and launches several kernels.
 A launch takes the host {launch["3"]:.1f} microseconds with 3 arrays and {launch["24"]:.1f} with
 24, without the driver's part.
 
-Instructions of an iteration of the inner loops: a warp of 8x4 pixels visits a splat that is not drawn in it / one that
-is / adds up the gradient of one.
+Instructions of an iteration of the inner loops: a warp of 8x4 pixels tests which of 32 splats may be drawn in it /
+visits a splat that then is not drawn / one that is / adds up the gradient of one.
 
 | kernel | {" | ".join(architectures)} |
 |---|{"---|" * len(architectures)}
 {chr(10).join(loops)}
 
 A step at {WIDTH}x{HEIGHT}, scaled up from {1 / SCALE:.0f} times fewer pixels and anchors: splats that are opaque
-enough, splats in the image, visits of a splat by a warp in millions, the fraction of them in which it is drawn, and the
-gigabytes of all arguments.
+enough, splats in the image, splats tested by a warp in millions, the fractions of them that may be drawn and that are
+drawn, and the gigabytes of all arguments.
 
-| splats | anchors | splats | in the image | visits | drawn | GB |
-|---|---|---|---|---|---|---|
+| splats | anchors | splats | in the image | tested | may be drawn | drawn | GB |
+|---|---|---|---|---|---|---|---|
 {chr(10).join(sizes)}
 
 The shortest time in which cards could move these bytes once and issue these instructions, in milliseconds. Latency,

@@ -32,6 +32,7 @@ struct Thread {
     int index;
     State state;
     bool vote, started;
+    unsigned votes;
     ucontext_t context;
     jmp_buf place;
     std::vector<char> stack;
@@ -86,14 +87,16 @@ static void resume(Thread *thread) {
 static bool release(int first, int last, State barrier) {
     int waiting = 0;
     bool any = false;
+    unsigned votes = 0;
     for (int i = first; i < last; i++) {
         if (pool[i]->state == DONE) continue;
         if (pool[i]->state != barrier) return false;
         waiting++;
         any |= pool[i]->vote;
+        votes |= (unsigned)pool[i]->vote << i % WARP;
     }
     for (int i = first; i < last; i++)
-        if (pool[i]->state == barrier) pool[i]->state = READY, pool[i]->vote = any;
+        if (pool[i]->state == barrier) pool[i]->state = READY, pool[i]->vote = any, pool[i]->votes = votes;
     return waiting > 0;
 }
 
@@ -101,7 +104,7 @@ static bool release(int first, int last, State barrier) {
 static bool run(void (*kernel)(void **), void **arguments, int blocks, int threads_of_block) {
     work = kernel, parameters = arguments, threads = threads_of_block;
     while ((int)pool.size() < threads)
-        pool.push_back(new Thread{(int)pool.size(), DONE, false, false, {}, {}, std::vector<char>(65536)});
+        pool.push_back(new Thread{(int)pool.size(), DONE, false, false, 0, {}, {}, std::vector<char>(65536)});
     for (block = 0; block < blocks; block++) {
         arrays.clear();
         for (int i = 0; i < threads; i++) pool[i]->state = READY, pool[i]->started = pool[i]->vote = false;
@@ -150,6 +153,11 @@ DEVICE bool any_in_warp(bool condition) {
     sync_warp();
     return emulator::current->vote;
 }
+DEVICE unsigned votes_of_warp(bool condition) {
+    any_in_warp(condition);
+    return emulator::current->votes;
+}
+DEVICE int lowest_bit(unsigned bits) { return __builtin_ctz(bits); }
 DEVICE void largest_in_block(int *place, int value) { *place = *place < value ? value : *place; }
 DEVICE void count_up(long long *number) { ++*number; }
 DEVICE float reciprocal(float x) { return 1.0f / x; }

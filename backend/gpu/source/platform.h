@@ -6,6 +6,8 @@
 // SHARED(type, name, dims) declares an array in the shared memory of a block, aligned to 16 bytes.
 // largest_in_block(p, x)   sets *p to x if that is larger, for all threads; count_up(p) adds 1 to *p.
 // any_in_warp(condition)   is false only if the condition holds in no thread of the warp.
+// votes_of_warp(condition) has bit i set if the condition holds in thread i of the warp.
+// lowest_bit(bits)         is the number of the lowest bit that is set.
 #ifndef PLATFORM_H
 #define PLATFORM_H
 
@@ -30,6 +32,7 @@ DEVICE bool any_in_block(bool condition) { return __syncthreads_or(condition); }
 DEVICE void largest_in_block(int *place, int value) { atomicMax(place, value); }
 DEVICE void count_up(long long *number) { atomicAdd((unsigned long long *)number, 1ULL); }
 DEVICE int bits_of(float x) { return __float_as_int(x); }
+DEVICE int lowest_bit(unsigned bits) { return __ffs((int)bits) - 1; }
 
 #if defined(__HIP_PLATFORM_AMD__) || defined(__HIP__)
 
@@ -39,12 +42,17 @@ DEVICE void sync_warp() {
     __builtin_amdgcn_wave_barrier();
 }
 DEVICE bool any_in_warp(bool condition) { return __any(condition); }
+DEVICE unsigned votes_of_warp(bool condition) {
+    // Of a wave of 64 threads, those of this half.
+    return (unsigned)(__ballot(condition) >> (threadIdx.x & WARP & (warpSize - 1)));
+}
 DEVICE float reciprocal(float x) { return __builtin_amdgcn_rcpf(x); }
 
 #else
 
 DEVICE void sync_warp() { __syncwarp(); }
 DEVICE bool any_in_warp(bool condition) { return __any_sync(0xffffffffu, condition); }
+DEVICE unsigned votes_of_warp(bool condition) { return __ballot_sync(0xffffffffu, condition); }
 DEVICE float reciprocal(float x) { return __fdividef(1.0f, x); }
 
 #endif

@@ -15,6 +15,8 @@ KERNEL(THREADS, 1) blend(
     const int tile_x = tile % columns * TILE, tile_y = tile / columns * TILE;
     const int px = tile_x + column_of(thread), py = tile_y + line_of(thread);
     const float x = (float)column_of(thread), y = (float)py + 0.5f;
+    const float warp_x = (float)column_of(thread - thread % WARP);
+    const float warp_y = (float)(tile_y + line_of(thread - thread % WARP)) + 0.5f;
     const bool inside = px < width && py < height;
     const size_t pixel = (size_t)py * width + px, plane = (size_t)width * height;
     const int label = LABELS && inside ? labels[pixel] : -1;
@@ -33,37 +35,43 @@ KERNEL(THREADS, 1) blend(
         }
         sync_block();
         const int count = MIN(STAGED, last - base);
-        for (int k = 0; k < count && t >= (float)TRANSMITTANCE_THRESHOLD; k++) {
-            const float *row = stage[k];
-            float q, per_q;
-            const float exponent = exponent_of(row, x, y, &q, &per_q);
-            if (!(exponent >= (float)LOG2_CUT)) continue;
-            needed = base - first + k + 1;
-            const float alpha = MIN(exp2f(exponent), (float)ALPHA_MAX);
-            const float w = alpha * t, after = t * (1.0f - alpha);
-            red += w * row[S_RED];
-            green += w * row[S_GREEN];
-            blue += w * row[S_BLUE];
-            if (LABELS && owners[k] == label) probability += w;
+        // Each thread of a warp looks whether one of 32 splats may be drawn in the warp's pixels.
+        for (int group = 0; group < count; group += WARP) {
+            const int mine = group + thread % WARP;
+            unsigned votes = votes_of_warp(mine < count && may_be_drawn(stage[mine], warp_x, warp_y));
+            for (; votes && t >= (float)TRANSMITTANCE_THRESHOLD; votes &= votes - 1) {
+                const int k = group + lowest_bit(votes);
+                const float *row = stage[k];
+                float q, per_q;
+                const float exponent = exponent_of(row, x, y, &q, &per_q);
+                if (!(exponent >= (float)LOG2_CUT)) continue;
+                needed = base - first + k + 1;
+                const float alpha = MIN(exp2f(exponent), (float)ALPHA_MAX);
+                const float w = alpha * t, after = t * (1.0f - alpha);
+                red += w * row[S_RED];
+                green += w * row[S_GREEN];
+                blue += w * row[S_BLUE];
+                if (LABELS && owners[k] == label) probability += w;
 #if DEPTHS || MEDIAN
-            float z = row[S_DEPTH];
-            if (FLAT && per_q > 0.0f) z *= per_q;
-            if (DEPTHS) z_sum += w * z;
-            if (MEDIAN && t >= 0.5f && after < 0.5f) z_median = z;
+                float z = row[S_DEPTH];
+                if (FLAT && per_q > 0.0f) z *= per_q;
+                if (DEPTHS) z_sum += w * z;
+                if (MEDIAN && t >= 0.5f && after < 0.5f) z_median = z;
 #endif
 #if NORMALS
-            nx += w * row[S_NORMAL_X];
-            ny += w * row[S_NORMAL_Y];
-            nz += w * row[S_NORMAL_Z];
+                nx += w * row[S_NORMAL_X];
+                ny += w * row[S_NORMAL_Y];
+                nz += w * row[S_NORMAL_Z];
 #endif
 #if MOMENTS
-            float inverse = row[PER_DEPTH] * q;
-            if (t >= 1.0f) origin = inverse;
-            inverse -= origin;
-            m1 += w * inverse;
-            m2 += w * inverse * inverse;
+                float inverse = row[PER_DEPTH] * q;
+                if (t >= 1.0f) origin = inverse;
+                inverse -= origin;
+                m1 += w * inverse;
+                m2 += w * inverse * inverse;
 #endif
-            t = after;
+                t = after;
+            }
         }
     }
     sync_block();

@@ -21,6 +21,7 @@
 
 struct Pixel {
     int thread, label;
+    unsigned long long votes;  // of the staged splats that may be drawn in the pixels of the warp
     float x, y, t, remaining, g_alpha, g_label_probability;
 };
 
@@ -31,14 +32,17 @@ DEVICE void weigh(
     float (*weights)[SPLAT_FLOATS], signed char (*hits)[WARPS], Pixel &at) {
     const int thread = at.thread;
     const float g_red = pixels[0][thread], g_green = pixels[1][thread], g_blue = pixels[2][thread];
-    for (int s = 0; s < count; s++) {
+    if (thread % WARP < count) hits[thread % WARP][thread / WARP] = 0;
+    sync_warp();
+    for (unsigned votes = (unsigned)(at.votes >> base) & ((1u << WARPS) - 1); votes; votes &= votes - 1) {
+        const int s = lowest_bit(votes);
         const float *row = stage[base + s];
         float q = 1.0f, per_q = 0.0f;
         const float exponent = exponent_of(row, at.x, at.y, &q, &per_q);
         const bool drawn = exponent >= (float)LOG2_CUT && at.t >= (float)TRANSMITTANCE_THRESHOLD;
         const bool hit = any_in_warp(drawn);
-        if (thread % WARP == 0) hits[s][thread / WARP] = hit;
         if (!hit) continue;
+        if (thread % WARP == 0) hits[s][thread / WARP] = 1;
         float w = 0.0f, slope = 0.0f;
         if (drawn) {
             const float raw = exp2f(exponent);
@@ -175,7 +179,8 @@ KERNEL(THREADS, FLAT ? 3 : 4) blend_backward(
     const int tile_x = tile % columns * TILE, tile_y = tile / columns * TILE;
     const int px = tile_x + column_of(thread), py = tile_y + line_of(thread);
     const size_t pixel = (size_t)py * width + px, plane = (size_t)width * height;
-    Pixel at = {thread, -1, (float)column_of(thread), (float)py + 0.5f, 0.0f, 0.0f, 0.0f, 0.0f};
+    const float warp_x = (float)column_of(warp * WARP), warp_y = (float)(tile_y + line_of(warp * WARP)) + 0.5f;
+    Pixel at = {thread, -1, 0, (float)column_of(thread), (float)py + 0.5f, 0.0f, 0.0f, 0.0f, 0.0f};
     for (int i = 0; i < KEPT; i++) pixels[i][thread] = 0.0f;
     if (px < width && py < height) {
         at.t = 1.0f;
@@ -217,6 +222,12 @@ KERNEL(THREADS, FLAT ? 3 : 4) blend_backward(
             stage_splat(splats, tilts, n, tile_x, height, stage[thread]);
         }
         sync_block();
+        at.votes = 0;
+        for (int group = 0; group < here; group += WARP) {
+            const int mine = group + lane;
+            const bool may = mine < here && may_be_drawn(stage[mine], warp_x, warp_y);
+            at.votes |= (unsigned long long)votes_of_warp(may) << group;
+        }
         for (int k = 0; k < here; k += WARPS) {
             weigh(stage, owners, k, MIN(WARPS, here - k), pixels, weights, hits, at);
             sync_block();

@@ -6,6 +6,7 @@
 #include "platform.h"
 
 #define THREADS (TILE * TILE)
+#define COLUMNS_OF_WARP 8
 
 // Columns of a staged splat: its column U relative to the tile, the row of its center, the row that U refers to, and the
 // other values of a splat and, for discs, of a tilt. Rows are a multiple of 16 bytes, for loads of four values.
@@ -64,6 +65,31 @@ DEVICE float exponent_of(const float *row, float x, float y, float *q, float *pe
 #else
     return row[TOP] - row[DOWN] * dy * dy - row[ACROSS] * d * d;
 #endif
+}
+
+// Whether a splat may be drawn in a pixel of a warp: in its rows, at most at the pixel nearest to the ridge, or to the
+// spot of a disc. x, y: the pixel of the warp's first thread. The slack covers rounding.
+DEVICE bool may_be_drawn(const float *row, float x, float y) {
+    const float reach = row[TOP] - (float)LOG2_CUT + 0.1f;
+    bool found = false;
+    for (int line = 0; line < WARP / COLUMNS_OF_WARP; line++) {
+        float left, right, dy;
+        offsets(row, x, y + line, &left, &dy);
+        right = left + (COLUMNS_OF_WARP - 1);
+        const float d = left > 0.0f ? left : right < 0.0f ? right : 0.0f;
+        const float fall = row[ACROSS] * d * d + row[DOWN] * dy * dy;
+#if FLAT
+        // Q is linear along the row.
+        const float q = row[S_Q0] + row[S_QY] * (y + line - row[ANCHOR]);
+        const float largest = MAX(fabsf(q + row[S_QX] * left), fabsf(q + row[S_QX] * right));
+        const float from = x - row[S_SPOT_U], to = from + (COLUMNS_OF_WARP - 1);
+        const float ds = from > 0.0f ? from : to < 0.0f ? to : 0.0f;
+        found = found || fall <= reach * largest * largest || (float)SPOT * (ds * ds + dy * dy) <= reach;
+#else
+        found = found || fall <= reach;
+#endif
+    }
+    return found;
 }
 
 DEVICE int column_of(int thread) { return thread % WARP % 8 + thread / WARP % 2 * 8; }
