@@ -31,8 +31,6 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-EMULATE = "OBJECTGS_EMULATE_GPU"
-os.environ[EMULATE] = "1"
 ROOT = Path(__file__).resolve().parents[1]
 if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
@@ -49,9 +47,9 @@ from backend.gpu import driver
 from backend.gpu import kernel as kernels
 from backend.labels import vote
 from backend.model.object_model import first_anchors_in_view
+from backend.raster.discs import SPOT
 from backend.raster.gpu import binning, renderer
 from backend.raster.gpu.kernels import TILE, raster_kernel
-from backend.raster.discs import SPOT
 from backend.raster.settings import ALPHA_MIN
 from backend.shared.events import Reporter
 from backend.training import step
@@ -60,17 +58,20 @@ from backend.training.step import frustum
 from backend.training.trainer import Trainer
 from benchmarks import documents
 
+EMULATE = "OBJECTGS_EMULATE_GPU"
 POINTS, WIDTH, HEIGHT = 100_000, 1920, 1080
 SCALE = 1 / 16
 """The emulated step has this fraction of the pixels and the anchors, whose sizes in pixels are the same."""
 CARDS = {
-    "RTX 2060": ("sm_75", 30, 1.68, 336),
-    "RTX 4070": ("sm_89", 46, 2.475, 504),
-    "H100 SXM": ("sm_90", 132, 1.83, 3350),
+    "RTX 2060": ("sm_75", 30, 1.68, 336, 2),
+    "RTX 4070": ("sm_89", 46, 2.475, 504, 2),
+    "H100 SXM": ("sm_90", 132, 1.83, 3350, 64),
 }
-"""Architecture, multiprocessors, boost clock in GHz and memory bandwidth in GB/s, by NVIDIA's data sheets. A
-multiprocessor of each issues four warp instructions a clock."""
-BLENDING = ("blend", "blend_backward")
+"""Architecture, multiprocessors, boost clock in GHz, memory bandwidth in GB/s, and operations in double that a
+multiprocessor does a clock, by NVIDIA's data sheets. A multiprocessor of each issues four warp instructions a clock."""
+BLENDING, PROJECTION = ("blend", "blend_backward"), ("project", "project_backward")
+PARTS = (*BLENDING, "projection", "other kernels", "torch", "step")
+OFFSETS = 10
 NAMES = {"3d": "Gaussians", "2d": "discs"}
 STEPS, SAMPLED_TILES = 40, 150
 WARP = kernels.WARP
@@ -203,7 +204,7 @@ def launch_microseconds() -> dict[str, float]:
 def large_step(primitive: str, scratch: Path) -> tuple[dict[str, Any], dict[str, kernels.Kernel]]:
     """Run a step with many splats; returns the bytes of each kernel and the numbers of iterations, and the kernels."""
     capture = load_capture(scratch / "capture", scratch / "cache", reporter=Reporter())
-    settings = Settings(primitive=primitive, voxel=1e-3, pyramid=(1,), max_anchors=10 * POINTS)
+    settings = Settings(primitive=primitive, offsets=OFFSETS, voxel=1e-3, pyramid=(1,), max_anchors=10 * POINTS)
     trainer = Trainer.start(capture, vote(capture, reporter=Reporter()).ids, settings)
     frames = []
     forward = renderer.forward
@@ -254,7 +255,7 @@ def iterations(frame: renderer.Frame) -> dict[str, float]:
             q0, qx, qy, nearest, spot_u = (tilts[n, i, None, None] for i in range(5))
             q = q0 + qy * along + qx * d
             spot = SPOT * ((x - spot_u) ** 2 + dy * dy)
-            fall = np.where((q > 0) & (1 >= nearest * q), fall / np.where(q == 0, 1, q * q), np.inf)
+            fall = np.where((q > 0) & (nearest * q <= 1), fall / np.where(q == 0, 1, q * q), np.inf)
         drawn = np.minimum(fall, spot) <= reach
         # Of a warp's 8x4 pixels: the bound of each row is that of its pixel nearest to the ridge.
         rows = (len(n), 4, 4, 2, 8)
@@ -291,9 +292,11 @@ def loops_of(text: str) -> tuple[list[str], list[tuple[int, int]]]:
 
 
 def instructions_of_loops(text: str) -> dict[str, int]:
-    """Return the instructions of a blending kernel's iterations: of the loop in which a warp tests 32 splats ("tested"),
-    of that over candidates, where no pixel of the warp is drawn ("missed") and where one is ("hit"), and of the loop over
-    warps that sums up gradients ("summed")."""
+    """Return the instructions of a blending kernel's iterations.
+
+    "tested": of the loop in which a warp tests 32 splats; "missed" and "hit": of that over candidates, where no pixel
+    of the warp is drawn and where one is; "summed": of the loop over warps that sums up gradients.
+    """
     lines, spans = loops_of(text)
 
     def smallest(holds: Callable[[list[str]], bool]) -> tuple[int, int]:
@@ -336,7 +339,8 @@ def compiled(
                 text = subprocess.run([nvdisasm, "-c", file.name], capture_output=True, text=True, check=True).stdout
             loops = instructions_of_loops(text) if name in BLENDING else {}
             found.setdefault(name, {})[architecture] = {
-                "instructions": len(re.findall(r"/\*[0-9a-f]{4,}\*/", text)), **loops,
+                "instructions": len(re.findall(r"/\*[0-9a-f]{4,}\*/", text)),
+                "double": len(re.findall(r"\s(D(FMA|MUL|ADD|SETP|MNMX)|MUFU\.\w*64\w*)", text)), **loops,
             }  # fmt: skip
     os.environ[EMULATE] = "1"
     return found
@@ -345,7 +349,7 @@ def compiled(
 def predicted(step: Mapping[str, Any], code: Mapping[str, Any]) -> dict[str, dict[str, float]]:
     """Return a lower bound of the milliseconds of a step's parts on each card."""
     found = {}
-    for card, (architecture, processors, gigahertz, bandwidth) in CARDS.items():
+    for card, (architecture, processors, gigahertz, bandwidth, doubles) in CARDS.items():
         parts: dict[str, float] = collections.Counter({"torch": 1e-6 * step["torch_bytes"] / bandwidth})
         for name, moved in step["bytes"].items():
             issued = 0.0
@@ -354,8 +358,13 @@ def predicted(step: Mapping[str, Any], code: Mapping[str, Any]) -> dict[str, dic
                 issued = step["visits"] * loop["missed"] + step["hits"] * (
                     loop["hit"] - loop["missed"] + loop["summed"]
                 )
-            part = name if name in BLENDING else "other kernels"
-            parts[part] += max(1e-6 * moved / bandwidth, 1e-6 * issued / (4 * processors * gigahertz))
+            in_double = step["anchors"] * OFFSETS * code[name][architecture]["double"] if name in PROJECTION else 0
+            part = name if name in BLENDING else "projection" if name in PROJECTION else "other kernels"
+            parts[part] += max(
+                1e-6 * moved / bandwidth,
+                1e-6 * issued / (4 * processors * gigahertz),
+                1e-6 * in_double / (doubles * processors * gigahertz),
+            )
         found[card] = {**parts, "step": sum(parts.values())}
     return found
 
@@ -396,21 +405,24 @@ def document(figures: Mapping[str, Any]) -> str:
         lines.append(f"| {name} | {of['kernels']} | {of['torch']} | {of['host_ms']:.2f} ({of['host_ms_least']:.2f}) |")
     launch = figures["launch_us"]
     architectures = list(next(iter(code["3d"].values())))
-    loops = []
+    loops, doubles = [], []
     for primitive, kernels_of in code.items():
         for name in BLENDING:
-            cells = [" / ".join(str(v) for k, v in kernels_of[name][a].items() if k != "instructions" and v)
+            cells = [" / ".join(str(v) for k, v in kernels_of[name][a].items() if k not in ("instructions", "double") and v)
                      for a in architectures]  # fmt: skip
             loops.append(f"| {name}, {NAMES[primitive]} | {' | '.join(cells)} |")
+        for name in PROJECTION:
+            cells = [str(kernels_of[name][a]["double"]) for a in architectures]
+            doubles.append(f"| {name}, {NAMES[primitive]} | {' | '.join(cells)} |")
     sizes, times = [], []
     for primitive, of in step.items():
         sizes.append(
             f"| {NAMES[primitive]} | {of['anchors']:,.0f} | {of['splats']:,.0f} | {of['drawn']:,.0f} | "
-            f"{of['visits'] / 1e6:.0f} | "
-            f"{of['candidates'] / of['visits']:.2f} | {of['hits'] / of['visits']:.2f} | {(sum(of['bytes'].values()) + of['torch_bytes']) / 1e9:.2f} |"
+            f"{of['visits'] / 1e6:.0f} | {of['candidates'] / of['visits']:.2f} | {of['hits'] / of['visits']:.2f} | "
+            f"{(sum(of['bytes'].values()) + of['torch_bytes']) / 1e9:.2f} |"
         )
         for card, parts in figures["predicted"][primitive].items():
-            cells = [f"{parts[part]:.2f}" for part in (*BLENDING, "other kernels", "torch", "step")]
+            cells = [f"{parts[part]:.2f}" for part in PARTS]
             times.append(f"| {NAMES[primitive]}, {card} | {' | '.join(cells)} |")
     return f"""# Cost of a training step on a GPU
 
@@ -434,6 +446,12 @@ visits a splat that then is not drawn / one that is / adds up the gradient of on
 |---|{"---|" * len(architectures)}
 {chr(10).join(loops)}
 
+Instructions in double, of which most cards do few:
+
+| kernel | {" | ".join(architectures)} |
+|---|{"---|" * len(architectures)}
+{chr(10).join(doubles)}
+
 A step at {WIDTH}x{HEIGHT}, scaled up from {1 / SCALE:.0f} times fewer pixels and anchors: splats that are opaque
 enough, splats in the image, splats tested by a warp in millions, the fractions of them that may be drawn and that are
 drawn, and the gigabytes of all arguments.
@@ -445,8 +463,8 @@ drawn, and the gigabytes of all arguments.
 The shortest time in which cards could move these bytes once and issue these instructions, in milliseconds. Latency,
 caches and occupancy are left out, so a card will take longer.
 
-| | {" | ".join(BLENDING)} | other kernels | torch | step |
-|---|---|---|---|---|---|
+| | {" | ".join(PARTS)} |
+|---|{"---|" * len(PARTS)}
 {chr(10).join(times)}
 """
 
@@ -459,6 +477,7 @@ def main() -> None:
     options = parser.parse_args()
     if not options.nvrtc or not options.nvdisasm:
         parser.error("NVRTC or nvdisasm is missing; install nvidia-cuda-nvrtc and triton, or name them")
+    os.environ[EMULATE] = "1"
     torch.manual_seed(0)
     figures: dict[str, Any] = {"host": {}, "launch_us": launch_microseconds(), "step": {}, "code": {}, "predicted": {}}
     with tempfile.TemporaryDirectory() as folder:
