@@ -71,6 +71,7 @@ CARDS = {
 multiprocessor does a clock, by NVIDIA's data sheets. A multiprocessor of each issues four warp instructions a clock."""
 BLENDING, PROJECTION = ("blend", "blend_backward"), ("project", "project_backward")
 PARTS = (*BLENDING, "projection", "other kernels", "torch", "step")
+LOOPS = ("tested", "missed", "hit", "summed")
 OFFSETS = 10
 NAMES = {"3d": "Gaussians", "2d": "discs"}
 STEPS, SAMPLED_TILES = 40, 150
@@ -262,8 +263,8 @@ def iterations(frame: renderer.Frame) -> dict[str, float]:
         d, q = d.reshape(rows), np.abs(q.reshape(rows))
         nearest_d = np.where((d[..., 0] <= 0) & (d[..., -1] >= 0), 0, np.minimum(abs(d[..., 0]), abs(d[..., -1])))
         dy = np.broadcast_to(dy, (len(n), TILE, TILE)).reshape(rows)[..., 0]
-        bound = a[..., None, None] * nearest_d**2 + c[..., None, None] * dy**2
-        may = bound <= reach[..., None, None] * q.max(-1) ** 2
+        bound = a[..., None] * nearest_d**2 + c[..., None] * dy**2
+        may = bound <= reach[..., None] * q.max(-1) ** 2
         may |= np.broadcast_to(spot <= reach, drawn.shape).reshape(rows).any(-1)
         found += 8 * len(n), may.any(2).sum(), drawn.reshape(rows).any((2, 4)).sum()
     visits = 8 * int(counts.sum())
@@ -303,7 +304,11 @@ def instructions_of_loops(text: str) -> dict[str, int]:
         return min((span for span in spans if holds(lines[slice(*span)])), key=lambda span: span[1] - span[0])
 
     over_splats = smallest(lambda loop: any("MUFU.EX2" in words for words in loop))
-    tests = smallest(lambda loop: any(re.search(r"VOTE.ANY R\d+, PT", words) for words in loop))
+    tests = smallest(
+        lambda loop: (
+            any(re.search(r"VOTE.ANY R\d+, PT", words) for words in loop) and sum("FFMA" in words for words in loop) > 4
+        )
+    )
     nested = [over_splats] if tests[0] <= over_splats[0] and over_splats[1] <= tests[1] else []
     body = lines[slice(*over_splats)]
     # The compiler may have unrolled the loop.
@@ -355,9 +360,8 @@ def predicted(step: Mapping[str, Any], code: Mapping[str, Any]) -> dict[str, dic
             issued = 0.0
             if name in BLENDING:
                 loop = code[name][architecture]
-                issued = step["visits"] * loop["missed"] + step["hits"] * (
-                    loop["hit"] - loop["missed"] + loop["summed"]
-                )
+                issued = step["visits"] * loop["tested"] / WARP + step["candidates"] * loop["missed"]
+                issued += step["hits"] * (loop["hit"] - loop["missed"] + loop["summed"])
             in_double = step["anchors"] * OFFSETS * code[name][architecture]["double"] if name in PROJECTION else 0
             part = name if name in BLENDING else "projection" if name in PROJECTION else "other kernels"
             parts[part] += max(
@@ -408,8 +412,8 @@ def document(figures: Mapping[str, Any]) -> str:
     loops, doubles = [], []
     for primitive, kernels_of in code.items():
         for name in BLENDING:
-            cells = [" / ".join(str(v) for k, v in kernels_of[name][a].items() if k not in ("instructions", "double") and v)
-                     for a in architectures]  # fmt: skip
+            counts = [[kernels_of[name][a][kind] for kind in LOOPS] for a in architectures]
+            cells = [" / ".join(str(count or "-") for count in of) for of in counts]
             loops.append(f"| {name}, {NAMES[primitive]} | {' | '.join(cells)} |")
         for name in PROJECTION:
             cells = [str(kernels_of[name][a]["double"]) for a in architectures]
