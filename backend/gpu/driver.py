@@ -21,6 +21,9 @@ from torch.cuda import _utils as libraries
 
 from ..shared.formats.atomic import write_atomic
 
+_NO_CONTEXT = 201
+"""Status of the driver in a thread that has no context of the GPU yet."""
+
 
 def load(name: str, source: str) -> Callable[[Any, int, int], None]:
     """Compile a kernel for the current GPU, or take it from the cache.
@@ -41,13 +44,19 @@ def load(name: str, source: str) -> Callable[[Any, int, int], None]:
     torch.cuda.current_stream().synchronize()
     driver = libraries._get_gpu_runtime_library()
     module, function = ctypes.c_void_p(), ctypes.c_void_p()
-    _check(driver, driver.cuModuleLoadData(ctypes.byref(module), _binary_of(name, source)))
+    if driver.cuModuleLoadData(ctypes.byref(module), _binary_of(name, source)):
+        # A file in the cache may be damaged.
+        _check(driver, driver.cuModuleLoadData(ctypes.byref(module), _binary_of(name, source, again=True)))
     _check(driver, driver.cuModuleGetFunction(ctypes.byref(function), module, name.encode()))
     run, current_stream, pointer = driver.cuLaunchKernel, torch.cuda.current_stream, ctypes.c_void_p
 
     def launch(pointers: Any, blocks: int, threads: int) -> None:
         stream = pointer(current_stream().cuda_stream)
         status = run(function, blocks, 1, 1, threads, 1, 1, 0, stream, pointers, None)
+        if status == _NO_CONTEXT:
+            # The first operation of a thread, for which torch makes one.
+            current_stream().synchronize()
+            status = run(function, blocks, 1, 1, threads, 1, 1, 0, stream, pointers, None)
         if status:
             _check(driver, status)
 
@@ -55,19 +64,24 @@ def load(name: str, source: str) -> Callable[[Any, int, int], None]:
 
 
 def _check(driver: ctypes.CDLL, status: int) -> None:
-    if status:
-        text = ctypes.c_char_p()
+    if not status:
+        return
+    text = ctypes.c_char_p()
+    if torch.version.hip:
+        driver.cuGetErrorString.restype = ctypes.c_char_p
+        text.value = driver.cuGetErrorString(status)
+    else:
         driver.cuGetErrorString(status, ctypes.byref(text))
-        raise RuntimeError(f"CUDA error: {text.value.decode() if text.value else status}")
+    raise RuntimeError(f"CUDA error: {text.value.decode() if text.value else status}")
 
 
-def _binary_of(name: str, source: str) -> bytes:
-    """Return a kernel's machine code for the current GPU."""
+def _binary_of(name: str, source: str, again: bool = False) -> bytes:
+    """Return a kernel's machine code for the current GPU; `again`: not from the cache."""
     option, compiler = _target(), _compiler()
     version = torch.version.hip or torch.version.cuda
     digest = hashlib.sha256(f"{option} {version} {source}".encode()).hexdigest()[:24]
     kept = Path(numba.config.CACHE_DIR) / f"objectgs-{name}-{digest}.bin" if numba.config.CACHE_DIR else None
-    if kept:
+    if kept and not again:
         with contextlib.suppress(OSError):
             return kept.read_bytes()
     binary = compile_source(compiler, name, source, [option])
@@ -89,17 +103,18 @@ def _target() -> str:
 
 @functools.cache
 def _compiler() -> ctypes.CDLL:
-    """Return the library NVRTC or HIPRTC."""
-    with contextlib.suppress(OSError):
+    """Return the library NVRTC or HIPRTC: of torch where it has one, since another may be older."""
+    if torch.version.cuda:
+        major, packages = torch.version.cuda.partition(".")[0], Path(torch.__file__).parents[1]
+        name = f"nvrtc64_{major}0_0.dll" if sys.platform == "win32" else f"libnvrtc.so.{major}"
+        for folder in ("torch/lib", "nvidia/*/lib", "nvidia/*/bin", "nvidia/*/bin/*"):
+            for path in sorted(packages.glob(f"{folder}/{name}")):
+                with contextlib.suppress(OSError):
+                    return ctypes.CDLL(str(path))
+    try:
         return libraries._get_gpu_rtc_library()
-    # torch may not have loaded NVRTC yet, which lies in a folder of its own.
-    packages = Path(torch.__file__).parents[1]
-    names = ["nvrtc64_*.dll"] if sys.platform == "win32" else ["libnvrtc.so.*"]
-    for folder in ("torch/lib", "nvidia/*/lib", "nvidia/*/bin", "nvidia/*/bin/*"):
-        for path in (found for name in names for found in sorted(packages.glob(f"{folder}/{name}"))):
-            with contextlib.suppress(OSError):
-                return ctypes.CDLL(str(path))
-    raise RuntimeError("the compiler NVRTC is missing, which comes with PyTorch's builds for CUDA")
+    except OSError as error:
+        raise RuntimeError(f"the compiler of GPU kernels is missing, which comes with PyTorch ({error})") from error
 
 
 def compile_source(compiler: ctypes.CDLL, name: str, source: str, options: list[str]) -> bytes:

@@ -139,7 +139,7 @@ class Kernel:
         elif not isinstance(argument, torch.Tensor) and isinstance(kind, str):
             if kind == "float":
                 return int(_BITS.unpack(_FLOAT.pack(argument))[0])
-            if argument == int(argument):
+            if kind in ("int", "long long") and argument == int(argument):
                 return int(argument)
         what: Any = argument
         if isinstance(argument, torch.Tensor):
@@ -159,7 +159,7 @@ def _type_of(words: str, variant: Mapping[str, Any]) -> torch.dtype | str:
     """Return the type of the elements of a parameter in C; its name for a parameter that is no pointer."""
     kind, pointer, _ = words.strip().removeprefix("const ").rpartition("*")
     if not pointer:
-        return words.split()[0]
+        return " ".join(words.split()[:-1])
     return _TYPES[str(variant.get(kind.strip(), kind.strip()))]
 
 

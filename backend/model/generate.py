@@ -94,7 +94,8 @@ class _GenerateOnGpu(torch.autograd.Function):
             count, positions, ids, rows, *outputs, present, count, means, quats, scales, opacities, sh, of_splats, valid
         )
         ctx.layout, ctx.parameters = layout, parameters
-        ctx.save = rows, inputs, hidden, scales, opacities, valid
+        # Autograd's outputs themselves would hold this node, and with it each other.
+        ctx.save = rows, inputs, hidden, scales.detach(), opacities.detach(), valid
         ctx.mark_non_differentiable(of_splats, valid)
         ctx.set_materialize_grads(False)
         return means, quats, scales, opacities, sh, of_splats, valid

@@ -71,7 +71,7 @@ class GrowthStatistics:
         Args:
             anchors_seen: (n,) int64, the anchors in view.
             offsets: k, number of splats per anchor.
-            source: (S,) int64, index in anchors_seen * k + offset of each splat.
+            source: (S,) int64, index in anchors_seen * k + offset of each splat; on a GPU, 0 .. S - 1.
             opacities: (S,), opacities of the splats.
             drawn: (S,) bool, the splats that overlap the image.
             screen_gradient: (S, 2), gradient with respect to the splats' centers in pixels.

@@ -57,8 +57,13 @@ def _array(renderer: Any, tensor: torch.Tensor, kind: torch.dtype = torch.float3
 
 
 def _tensor(array: Any) -> torch.Tensor | None:
-    """Convert the renderer's array or tensor to a tensor."""
-    return torch.from_numpy(array) if isinstance(array, np.ndarray) else array
+    """Return the renderer's array or tensor as a new tensor on the same memory.
+
+    A frame that held the tensors that autograd returns would hold itself, through their gradient function.
+    """
+    if isinstance(array, np.ndarray):
+        return torch.from_numpy(array)
+    return None if array is None else array.detach()
 
 
 class _Rasterize(torch.autograd.Function):

@@ -1,4 +1,4 @@
-"""Selection of the compute device, the CPU or an NVIDIA GPU through CUDA, and diagnosis if CUDA is not available.
+"""Selection of the compute device, the CPU or a GPU through CUDA or HIP, and diagnosis if no GPU is available.
 
 Functions with an implementation for each device call `on_gpu` with one of their tensors. If a GPU is emulated
 (OBJECTGS_EMULATE_GPU=1), tensors stay in host memory, and the GPU implementations are used.

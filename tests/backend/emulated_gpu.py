@@ -1,7 +1,9 @@
 """Tests of the GPU renderer alone, on an emulated GPU; test_gpu_kernels.py runs them."""
 
+import gc
 import itertools
 import shutil
+import weakref
 
 import numpy as np
 import pytest
@@ -9,6 +11,9 @@ import torch
 
 from backend.gpu import kernel as kernels
 from backend.gpu.emulator import emulated
+from backend.model.anchors import Layout, new_rows
+from backend.model.generate import generate
+from backend.model.heads import Heads
 from backend.raster.cpu import renderer as cpu
 from backend.raster.gpu import binning
 from backend.raster.gpu.kernels import STAGED
@@ -222,3 +227,39 @@ def test_tile_with_more_splats_than_shared_memory():
     np.testing.assert_allclose(
         frame.screen_gradient.numpy(), other.screen_gradient, rtol=1e-3, atol=1e-4 * np.abs(other.screen_gradient).max()
     )
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_memory_of_a_frame_is_released_without_collection(primitive):
+    """Nothing that a step keeps for its gradient holds itself."""
+    flat = primitive == "2d"
+    scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(0, count=12)).items()}
+    cam = camera()
+    labels = torch.zeros(cam.height, cam.width, dtype=torch.int32)
+    gc.disable()
+    try:
+        drawn = rasterize(
+            **scene, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat,
+            want_distortion=flat, primitive=primitive,
+        )  # fmt: skip
+        (drawn.color.sum() + drawn.label_probability.sum() + drawn.depth.sum()).backward()
+        frame = weakref.ref(drawn.frame)
+        del drawn
+        assert frame() is None
+    finally:
+        gc.enable()
+
+
+def test_memory_of_generated_splats_is_released_without_collection():
+    layout = Layout(4, 8)
+    rows = torch.from_numpy(new_rows(20, layout, np.random.default_rng(0))).requires_grad_()
+    heads = Heads(layout, "explicit", 1, torch.Generator().manual_seed(0))
+    gc.disable()
+    try:
+        made = generate(layout, torch.zeros(20, 3), rows, torch.zeros(20, dtype=torch.int32), heads)
+        (made.scales.sum() + made.opacities.sum()).backward()
+        node = weakref.ref(made.scales.grad_fn)
+        del made
+        assert node() is None
+    finally:
+        gc.enable()

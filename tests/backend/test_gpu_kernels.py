@@ -119,6 +119,10 @@ class Machine:
 
     def __init__(self, status=0):
         self.compiled, self.launched, self.status = [], [], status
+        self.synchronized = self.needed = 0
+
+    def synchronize(self):
+        self.synchronized += 1
 
     def nvrtcCreateProgram(self, program, source, name, *_):
         program._obj.value = 7
@@ -145,8 +149,7 @@ class Machine:
         return 0
 
     def cuModuleLoadData(self, module, binary):
-        assert binary == b"code"
-        return 0
+        return 0 if binary == b"code" else 200
 
     def cuModuleGetFunction(self, function, module, name):
         function._obj.value = 9
@@ -160,13 +163,13 @@ class Machine:
         *sizes, shared, stream, pointers, extra = words
         values = [ctypes.cast(p, ctypes.POINTER(ctypes.c_uint64))[0] for p in pointers]
         self.launched.append((sizes, shared, stream.value, values, extra))
-        return self.status
+        return 201 if self.synchronized < self.needed else self.status
 
 
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
     made = Machine()
-    stream = SimpleNamespace(cuda_stream=1234, synchronize=lambda: None)
+    stream = SimpleNamespace(cuda_stream=1234, synchronize=made.synchronize)
     monkeypatch.setattr(driver.libraries, "_get_gpu_runtime_library", lambda: made)
     monkeypatch.setattr(driver.libraries, "_get_gpu_rtc_library", lambda: made)
     monkeypatch.setattr(torch.cuda, "init", lambda: None)
@@ -198,6 +201,24 @@ def test_kernel_is_compiled_once_and_launched_with_its_arguments(machine):
     raster_kernel.cache_clear()
     write_keys()(1, 128, splats, 3, keys)
     assert len(machine.compiled) == 1 and len(machine.launched) == 3
+
+
+def test_damaged_binary_in_cache_is_compiled_again(machine, tmp_path):
+    arguments = torch.zeros(3, 12), 3, torch.zeros(3, dtype=torch.int64)
+    write_keys()(1, 32, *arguments)
+    (kept,) = (tmp_path / "cache").iterdir()
+    kept.write_bytes(b"damaged")
+    raster_kernel.cache_clear()
+    write_keys()(1, 32, *arguments)
+    assert len(machine.compiled) == len(machine.launched) == 2 and kept.read_bytes() == b"code"
+
+
+def test_thread_without_context_gets_one(machine):
+    arguments = torch.zeros(3, 12), 3, torch.zeros(3, dtype=torch.int64)
+    write_keys()(1, 32, *arguments)
+    machine.needed = machine.synchronized + 1
+    write_keys()(1, 32, *arguments)
+    assert len(machine.launched) == 3 and machine.synchronized == machine.needed
 
 
 def test_nothing_is_launched_for_no_elements(machine):

@@ -14,6 +14,7 @@ import numba
 import torch
 
 from ...gpu.emulator import emulated
+from ...gpu.kernel import digest_of_sources
 from ...raster import compile_kernels, devices
 from ...raster.kernel import digest_up_to
 from ...shared.events import Reporter
@@ -111,6 +112,8 @@ def _are_ready(device: torch.device) -> bool:
 def _mark(device: torch.device) -> Path:
     """Return the path of the file that marks the kernels of these sources as compiled for a device."""
     processor = f"{llvmlite.binding.get_host_cpu_name()} {devices.name_of(device)}"
+    if device.type != "cpu":
+        processor += f" {torch.__version__} {digest_of_sources()}"
     return path_beside_kernels(".ready", digest_up_to("stereo"), numba.__version__, processor)
 
 

@@ -1,1 +1,1 @@
-"""The GPU renderer: kernels in a dialect of C++ (`source/`), compiled at run time for CUDA, HIP or an emulator."""
+"""The GPU renderer; its kernels are in `backend/gpu/source/raster`."""
