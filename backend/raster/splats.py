@@ -1,4 +1,4 @@
-"""Projection of a 3D Gaussian or disc to a screen splat, and its gradient, for the CPU and the GPU.
+"""Projection of a 3D Gaussian or disc to a screen splat, and its gradient, on the CPU; `backend/gpu` has that of GPUs.
 
 3D Gaussians follow EWA splatting (Zwicker et al. 2001). A screen splat is stored in a form without cancellation within
 a pixel row: with the projected covariance [[a, b], [b, c]] (including the low-pass filter) and dy = y - v,

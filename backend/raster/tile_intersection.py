@@ -1,4 +1,4 @@
-"""Extents of a splat's ellipse in rows of tiles, and the order of splats with equal depth, for the CPU and the GPU."""
+"""Extents of a splat's ellipse in rows of tiles, and the order of splats with equal depth, on the CPU."""
 
 from __future__ import annotations
 
