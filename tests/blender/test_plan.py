@@ -19,9 +19,12 @@ from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.headless import commands
 from objectgs.objectgs_addon.headless.arguments import parse
+from objectgs.objectgs_addon.panels.training.plan import PlanPanel
 from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.state import planning
+
+from .drawn import texts_of
 
 
 @pytest.fixture
@@ -49,6 +52,13 @@ def root(fresh, trained, tmp_path):
 
 def test_training_writes_plan(trained):
     assert planning.plan_of(trained).does("votes") and not planning.plan_of(trained / "none").decisions
+
+
+def test_header_counts_parts_of_training_and_not_photos(root):
+    assert texts_of(PlanPanel, "draw_header_preset") == "2 parts skipped"
+    assert bpy.ops.objectgs.override_decision(key="exposure") == {"FINISHED"}
+    assert texts_of(PlanPanel, "draw_header_preset") == "1 part skipped"
+    assert "Undoing of exposure" in texts_of(PlanPanel)
 
 
 def test_overrides_are_passed_to_training_and_undone(root):

@@ -23,9 +23,11 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw_header_preset(self, context: bpy.types.Context) -> None:
-        left_out = len(planning.plan_for(context.scene.objectgs.active).left_out)
-        if left_out:
-            self.layout.label(text=f"{left_out} left out")
+        root = context.scene.objectgs.active
+        wanted = [planning.is_wanted(root.objectgs, decision) for decision in planning.plan_for(root).decisions]
+        skipped = wanted.count(False)
+        if skipped:
+            self.layout.label(text=f"{skipped} part{'s' if skipped > 1 else ''} skipped")
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
