@@ -9,7 +9,7 @@ from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import draw_over, draw_running, write
 from ..state import folder_trust
-from ..state.next_step import can_mark, has_masks, must_use_masks
+from ..state.next_step import can_mark, has_masks, is_capture_gone, must_use_masks
 
 
 class Tab:
@@ -26,13 +26,16 @@ class WithReconstruction(Tab):
 
 def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
     """Say how an empty list of objects is filled."""
+    state = folder_trust.state_of(root)
     if not folder_trust.is_accepted(root):
         text = "Objects are listed once the folder is used."
-    elif folder_trust.state_of(root).trained and must_use_masks(folder_trust.state_of(root)):
+    elif state.trained and must_use_masks(state):
         text = "Clean Up Labels gives the splats the objects of the masks."
-    elif has_masks(folder_trust.state_of(root)):
+    elif has_masks(state):
         text = "Assign Objects finds the objects by the masks."
-    elif folder_trust.state_of(root).trained and can_mark(folder_trust.state_of(root)):
+    elif is_capture_gone(state):
+        text = "Whether the capture has masks shows once its folder is found."
+    elif state.trained and can_mark(state):
         text = "Objects are listed once they are marked and separated."
     else:
         text = (

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import bpy
 
 from ...backend.shared.formats.regular_file import is_folder
-from ...backend.shared.reconstruction.folder import STROKES
+from ...backend.shared.reconstruction.folder import STROKES, Reconstruction
 from .. import scene
 from ..environment import known_folders, locations
 from ..picking import marks
@@ -109,6 +109,20 @@ def next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Step
 def is_capture_gone(state: FolderState) -> bool:
     """Return whether the folder of the capture does not exist; on another computer, it is not looked for."""
     return state.capture is not None and not known_folders.is_remote(state.capture) and not is_folder(state.capture)
+
+
+def capture_problem(root: bpy.types.Collection, state: FolderState) -> str | None:
+    """Return why the capture of a reconstruction cannot be used, without a period; None if it can."""
+    location = state.capture
+    if location is None:
+        return f"{Reconstruction(scene.folder_of(root)).cameras} does not name the capture; import it again"
+    if known_folders.is_remote(location) and not known_folders.is_known(location):
+        return f"The capture {location} is on another computer; import it again to use it"
+    if is_folder(location):
+        return None
+    return (
+        f"The capture {location} is missing; put it back, or use Find Capture, in the menu at the top if nowhere else"
+    )
 
 
 def find_step(root: bpy.types.Collection) -> Step:

@@ -9,16 +9,14 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.regular_file import is_folder
-from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.lock import lock_holder
 from ...objectgs_addon import scene
-from ...objectgs_addon.environment import known_folders, locations
+from ...objectgs_addon.environment import locations
 from ...objectgs_addon.picking import selection
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import folder_trust, object_list
 from ...objectgs_addon.state.folder_state import folder_state
-from ...objectgs_addon.state.next_step import can_mark, has_masks
+from ...objectgs_addon.state.next_step import can_mark, capture_problem, has_masks
 
 
 def active_root(context: bpy.types.Context) -> Any:
@@ -85,20 +83,11 @@ def _use_of(folder: Path) -> str | None:
 
 def capture(cls: Any, context: bpy.types.Context) -> bool:
     """Return whether the active reconstruction's capture folder exists."""
-    folder = scene.folder_of(active_root(context))
-    location = folder_state(folder).capture
-    if location is None:
-        cls.poll_message_set(f"{Reconstruction(folder).cameras} does not name the capture; import it again")
-        return False
-    if known_folders.is_remote(location) and not known_folders.is_known(location):
-        cls.poll_message_set(f"The capture {location} is on another computer; import it again to use it")
-        return False
-    if is_folder(location):
-        return True
-    cls.poll_message_set(
-        f"The capture {location} is missing; put it back, or use Find Capture, in the menu at the top if nowhere else"
-    )
-    return False
+    root = active_root(context)
+    problem = capture_problem(root, folder_state(scene.folder_of(root)))
+    if problem is not None:
+        cls.poll_message_set(problem)
+    return problem is None
 
 
 def splats(cls: Any, context: bpy.types.Context) -> bool:

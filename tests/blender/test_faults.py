@@ -23,9 +23,13 @@ from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.environment.worker import layout
+from objectgs.objectgs_addon.panels.objects import ObjectsPanel
+from objectgs.objectgs_addon.panels.training.train import TrainPanel
 from objectgs.objectgs_addon.process.jobs import Job, State
 from objectgs.objectgs_addon.running import background, handlers, results
 from objectgs.objectgs_addon.state import object_list
+
+from .drawn import texts_of
 
 FIXTURES = headless.ROOT.parent / "shared" / "data" / "fixtures"
 WAIT = 60.0
@@ -294,6 +298,23 @@ def test_deleted_capture_is_reported(extension, backend_python, capture, tmp_pat
     assert f"The capture {place} is missing" in error_report(bpy.ops.objectgs.train)
     (tmp_path / "out" / "cameras.json").write_text("{}")
     assert "does not name the capture" in error_report(bpy.ops.objectgs.train)
+
+
+def test_panels_name_a_missing_capture_before_its_masks(shown, folder, tmp_path):
+    """Masks of a folder that is gone cannot be looked for, so that there are none would be wrong."""
+    (folder / "splats.ply").unlink()
+    shutil.rmtree(folder / "checkpoint")
+    shown.objectgs.objects.clear()
+    cameras = json.loads((folder / "cameras.json").read_text())
+    gone = str(tmp_path / "gone")
+    for name, trouble in ((gone, "gone is missing; put it back"), (None, "does not name the capture")):
+        (folder / "cameras.json").write_text(json.dumps({**cameras, "capture": name}))
+        texts = texts_of(TrainPanel)
+        assert trouble in texts and "masks" not in texts
+    (folder / "cameras.json").write_text(json.dumps({**cameras, "capture": gone}))
+    assert "has no masks" not in texts_of(ObjectsPanel)
+    (tmp_path / "gone").mkdir()
+    assert "There are no masks" in texts_of(TrainPanel) and "has no masks" in texts_of(ObjectsPanel)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from ...running import background, previews
 from ...running.job_display import draw_figures, write
 from ...state import folder_trust
 from ...state.folder_state import FolderState
-from ...state.next_step import has_masks
+from ...state.next_step import capture_problem, has_masks
 from ..tab import WithReconstruction, draw_job_of
 from .presets import TrainingPresets
 
@@ -44,9 +44,7 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
             column.prop(properties, "minutes")
         is_accepted = folder_trust.is_accepted(root)
         if not active and is_accepted:
-            _draw_expectation(column, state, properties)
-            if not state.trained and state.imported and not has_masks(state):
-                _draw_faint(column, "There are no masks, so objects are marked after the training.")
+            _draw_outlook(column, root, state)
         if job is not None:
             draw_job_of(layout, job)
         if not is_accepted:
@@ -133,6 +131,18 @@ def _draw_folder_state(layout: bpy.types.UILayout, root: bpy.types.Collection, j
     if scene.result_is_newer(root):
         write(layout, "The result in the folder differs from the one shown.", "INFO")
         layout.operator("objectgs.show_result", icon="FILE_REFRESH")
+
+
+def _draw_outlook(layout: bpy.types.UILayout, root: bpy.types.Collection, state: FolderState) -> None:
+    """Draw what keeps the training from its photos, or else what is expected of it."""
+    needs_capture = state.imported and (state.steps or not state.trained)
+    problem = capture_problem(root, state) if needs_capture else None
+    if problem is not None:
+        write(layout, f"{problem}.", "ERROR")
+        return
+    _draw_expectation(layout, state, root.objectgs)
+    if not state.trained and state.imported and not has_masks(state):
+        _draw_faint(layout, "There are no masks, so objects are marked after the training.")
 
 
 def _draw_expectation(layout: bpy.types.UILayout, state: FolderState, properties: Any) -> None:
