@@ -28,6 +28,9 @@ def backend(cls: Any) -> bool:
     """Return whether the compute backend can be run."""
     if locations.backend_python() is not None:
         return True
+    if background.busy(locations.environment_folder()):
+        cls.poll_message_set("The backend is being set up; wait until it is done")
+        return False
     cls.poll_message_set(f"{locations.backend_sentence()} See the preferences of ObjectGS")
     return False
 

@@ -57,7 +57,12 @@ class StopMarking(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.shown(cls, context) and pointing.is_active(need.active_root(context))
+        if not need.shown(cls, context):
+            return False
+        if pointing.is_active(need.active_root(context)):
+            return True
+        cls.poll_message_set("Objects are not being marked; use Mark Objects first")
+        return False
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         pointing.stop()

@@ -48,7 +48,12 @@ class RemoveMarkedObject(_OfMarks, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return super().poll(context) and marks.active_object(need.active_root(context)) is not None
+        if not super().poll(context):
+            return False
+        if marks.active_object(need.active_root(context)) is not None:
+            return True
+        cls.poll_message_set("No object is marked yet")
+        return False
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)

@@ -17,6 +17,7 @@ import headless
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs import operators
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene
@@ -146,6 +147,30 @@ def test_missing_backend_is_reported(extension, shown, capture):
         assert not operator.poll()
     assert "is not set up; allow online access, then press Set Up Backend" in error_report(bpy.ops.objectgs.train)
     assert "is not set up" in error_report(bpy.ops.objectgs.import_capture, directory=str(capture))
+
+
+@pytest.mark.parametrize("with_backend", [False, True])
+def test_every_disabled_operator_says_why(extension, folder, backend_python, monkeypatch, with_backend):
+    """Without a reason, Blender's error names the context, and the tooltip of the button says nothing."""
+    if with_backend:
+        monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    disabled = set()
+    for place in (None, folder):
+        if place is not None:
+            bpy.ops.objectgs.open_reconstruction(directory=str(place))
+        for cls in operators._classes():
+            operator = getattr(bpy.ops.objectgs, cls.bl_idname.partition(".")[2])
+            if "INTERNAL" not in getattr(cls, "bl_options", ()) and not operator.poll():
+                disabled.add(cls.bl_idname)
+                assert "context is incorrect" not in error_report(operator), cls.bl_idname
+    assert {"objectgs.stop_marking", "objectgs.remove_marked_object", "objectgs.train"} <= disabled
+    assert ("objectgs.import_capture" in disabled) is not with_backend
+
+
+def test_disabled_imports_say_that_the_backend_is_being_set_up(extension, tmp_path):
+    place = locations.environment_folder()
+    start(job(tmp_path, UNTIL_STOPPED, kind="setup", folder=place), bpy.context.scene)
+    assert "is being set up" in error_report(bpy.ops.objectgs.import_photos)
 
 
 def test_outdated_backend_is_reported(extension, shown):
