@@ -5,14 +5,14 @@ import bpy
 
 from ...objectgs_addon.state import planning
 from ..common import need
-from ..common.jobs import submit_for_capture
+from ..common.jobs import STARTS_JOB, submit_for_capture
 
 
 class AnalyzeCapture(bpy.types.Operator):
     bl_idname = "objectgs.analyze_capture"
     bl_label = "Analyze Capture"
     bl_description = "Find out which parts of training this capture needs, with these settings and chosen objects"
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

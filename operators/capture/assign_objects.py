@@ -4,14 +4,14 @@
 import bpy
 
 from ..common import need
-from ..common.jobs import submit_for_capture
+from ..common.jobs import STARTS_JOB, submit_for_capture
 
 
 class AssignObjects(bpy.types.Operator):
     bl_idname = "objectgs.assign_objects"
     bl_label = "Assign Objects"
     bl_description = "Assign an object to each point by a vote of the masks, and fill the list of objects"
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

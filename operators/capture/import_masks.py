@@ -14,6 +14,7 @@ from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
 from ..common.import_dialog import ImportDialog
+from ..common.jobs import STARTS_JOB
 from ..common.reporting import reports_errors
 
 _FILES = ("*.json", "*.xml")
@@ -29,7 +30,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
         "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects. A folder with a "
         "checkpoint of SAM, SAM 2.1, EdgeTAM or SAM 3 makes the segments itself"
     )
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     filepath: StringProperty(name="Masks", subtype="FILE_PATH", description="File, or folder, with the masks")
     filter_glob: StringProperty(default=";".join([*_FILES, *(f"*{suffix}" for suffix in _IMAGES)]), options={"HIDDEN"})

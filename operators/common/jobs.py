@@ -13,6 +13,13 @@ from ...objectgs_addon.running import background
 from ...objectgs_addon.state.folder_state import folder_state
 from . import need
 
+STARTS_JOB = {"UNDO"}
+"""`bl_options` of operators that start a job on a reconstruction.
+
+The start is an undo step, or the first undo during the job would remove what came before it, such as the import. With
+REGISTER, Adjust Last Operation would start the job again.
+"""
+
 
 def submit_for_capture(
     operator: bpy.types.Operator, context: bpy.types.Context, title: str, command: str, *arguments: str

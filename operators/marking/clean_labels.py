@@ -7,6 +7,7 @@ from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
+from ..common.jobs import STARTS_JOB
 
 
 class CleanUpLabels(bpy.types.Operator):
@@ -16,7 +17,7 @@ class CleanUpLabels(bpy.types.Operator):
         "Correct parts of masks that the other photos contradict, and give the splats their objects anew. It takes a "
         "minute or two. The masks before are kept in the folder masks-given of the capture"
     )
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

@@ -14,6 +14,7 @@ from ...objectgs_addon.environment import locations
 from ...objectgs_addon.picking import marking_tool, marks
 from ...objectgs_addon.running import background, pointing
 from ..common import need
+from ..common.jobs import STARTS_JOB
 from ..common.reporting import reports_errors
 
 _LISTED = 3
@@ -115,7 +116,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
         "Give each marked object a collection of its own. After a training, the borders of the objects are trained "
         "for a short time, and masks of the photos are made"
     )
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

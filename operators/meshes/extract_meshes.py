@@ -8,6 +8,7 @@ from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ...objectgs_addon.state import object_list
 from ..common import need
+from ..common.jobs import STARTS_JOB
 from ..common.reporting import reports_errors
 
 
@@ -18,7 +19,7 @@ class ExtractMeshes(bpy.types.Operator):
         "Extract a textured mesh of each object in place, in the background. Existing meshes are updated and "
         "keep their materials; those that would not change are skipped"
     )
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:

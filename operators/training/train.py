@@ -12,6 +12,7 @@ from ...objectgs_addon.running import background
 from ...objectgs_addon.state import planning
 from ...objectgs_addon.state.folder_state import folder_state
 from ..common import need
+from ..common.jobs import STARTS_JOB
 from ..common.reporting import reports_errors
 
 
@@ -19,7 +20,7 @@ class Train(bpy.types.Operator):
     bl_idname = "objectgs.train"
     bl_label = "Train"
     bl_description = "Train the splats in the background, continuing an earlier training"
-    bl_options = {"REGISTER"}
+    bl_options = STARTS_JOB
 
     restart: BoolProperty(
         name="Retrain", options={"SKIP_SAVE"}, description="Discard the existing training and start over"

@@ -167,6 +167,14 @@ def test_every_disabled_operator_says_why(extension, folder, backend_python, mon
     assert ("objectgs.import_capture" in disabled) is not with_backend
 
 
+def test_starts_of_jobs_are_undo_steps_that_are_not_repeated():
+    """Undo during a training must not remove the import, and Adjust Last Operation must not train again."""
+    names = ("train", "assign_objects", "analyze_capture", "import_masks", "clean_up_labels", "separate_marked")
+    options = {cls.bl_idname: getattr(cls, "bl_options", set()) for cls in operators._classes()}
+    for name in (*names, "extract_meshes"):
+        assert "UNDO" in options[f"objectgs.{name}"] and "REGISTER" not in options[f"objectgs.{name}"]
+
+
 def test_disabled_imports_say_that_the_backend_is_being_set_up(extension, tmp_path):
     place = locations.environment_folder()
     start(job(tmp_path, UNTIL_STOPPED, kind="setup", folder=place), bpy.context.scene)
