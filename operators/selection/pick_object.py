@@ -4,13 +4,12 @@
 import time
 
 import bpy
-import gpu
 from bpy.props import BoolProperty, IntProperty
-from gpu_extras.batch import batch_for_shader
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.picking import hit_test, selection
 from ...objectgs_addon.picking import tool as pick_tool
+from ..common.path import draw_line, rectangle
 from ..common.viewport import InViewport, selection_mode
 
 _HIDDEN = {"HIDDEN", "SKIP_SAVE"}
@@ -139,11 +138,7 @@ class PickBox(InViewport, bpy.types.Operator):
         context.area.tag_redraw()
 
     def _draw(self) -> None:
-        (left, bottom), (right, top) = self._from, self._to
-        corners = [(left, bottom, 0), (right, bottom, 0), (right, top, 0), (left, top, 0), (left, bottom, 0)]
-        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-        shader.uniform_float("color", (1.0, 1.0, 1.0, 1.0))
-        batch_for_shader(shader, "LINE_STRIP", {"pos": corners}).draw(shader)
+        draw_line(rectangle([self._from, self._to]))
 
 
 class PointAt(InViewport, bpy.types.Operator):

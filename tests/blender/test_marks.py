@@ -25,7 +25,7 @@ from objectgs.objectgs_addon.running import background, pointing
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import can_mark
-from objectgs.operators.common import need
+from objectgs.operators.common import need, path
 
 import headless
 
@@ -413,6 +413,22 @@ def test_invalid_answers_end_the_process_with_a_sentence(root, session, change):
     session.failure = ""
     answer(session, [3], [0] * (len(session.keys) + 1))
     assert "not valid" in session.failure
+
+
+def test_lines_of_strokes_have_a_dark_outline(monkeypatch):
+    """A white line alone is lost on white objects."""
+    drawn, now = [], {}
+    shader = SimpleNamespace(uniform_float=now.__setitem__)
+    batch = SimpleNamespace(draw=lambda _shader: drawn.append((sum(now["color"][:3]), now["lineWidth"])))
+    state = SimpleNamespace(blend_set=lambda _mode: None, viewport_get=lambda: (0, 0, 80, 60))
+    made = SimpleNamespace(from_builtin=lambda _name: shader)
+    monkeypatch.setattr(path, "gpu", SimpleNamespace(shader=made, state=state))
+    monkeypatch.setattr(path, "batch_for_shader", lambda *_: batch)
+    system = SimpleNamespace(system=SimpleNamespace(ui_scale=2.0))
+    monkeypatch.setattr(path, "bpy", SimpleNamespace(context=SimpleNamespace(preferences=system)))
+    path.draw_line([(1, 2), (30, 40)])
+    (outline, wide), (line, narrow) = drawn
+    assert outline == 0 and line == 3 and wide > narrow + 2 and now["viewportSize"] == (80, 60)
 
 
 def test_splats_of_another_training_are_refused(session):
