@@ -26,6 +26,8 @@ from .wording import INSTALL, TRANSFORMERS, in_blender, lacking
 
 INTERVAL = 0.05
 """Time in seconds between two polls of the process."""
+_NOTICEABLE = 0.05
+"""Share of an object that a stroke on another one may take before it is told."""
 
 
 class _Session:
@@ -39,8 +41,11 @@ class _Session:
         job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *locations.segmenter_options())
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
-        self.problem, self.said, self.said_problem = "", "", False
+        self.problem, self.said, self.said_passes = "", "", False
         self.asked = self.answered = 0
+        self._asked_strokes: list[dict[str, Any]] = []
+        self._answered_strokes: list[dict[str, Any]] = []
+        self.taken: tuple[int, int, float] | None = None
         self.wanted_detail: float | None = None
         self.lacks = False
         self.proposed: dict[str, Any] | None = None
@@ -55,8 +60,10 @@ class _Session:
         if not content["strokes"]:
             self.objects, self.classes = np.zeros(1, np.int64), np.zeros(len(self.keys), np.int64)
             self.asked = self.answered = self.asked + 1
+            self._answered_strokes = []
             return
         self.asked += 1
+        self._asked_strokes = content["strokes"]
         self.process.send(json.dumps({"request": self.asked, **content}))
 
     def propose(self, detail: float) -> None:
@@ -109,14 +116,38 @@ class _Session:
             objects, classes = np.array(event["objects"], np.int64), np.concatenate(self._parts)
             if len(classes) != len(self.keys) or classes.max(initial=0) >= len(objects):
                 raise ValueError("its objects are not those of the splats")
+            self.taken = self._most_taken(objects[classes])
             self.objects, self.classes, self.answered = objects, classes, self.asked
+            self._answered_strokes = self._asked_strokes
 
-    def say(self, text: str, is_problem: bool = False) -> None:
-        """Show a message on the marks instead of the earlier one; "" for none."""
+    def _most_taken(self, owners: np.ndarray) -> tuple[int, int, float] | None:
+        """Return what the newest strokes have taken most of: who took, from which object, and which share of it.
+
+        owners: (N,) IDs of the objects to which the splats belong now. None if nothing noticeable was taken.
+        """
+        known = len(self._answered_strokes)
+        if self._asked_strokes[:known] != self._answered_strokes:
+            return None
+        drawn = {stroke["object"] for stroke in self._asked_strokes[known:]} - {marks.NOTHING}
+        before = self.objects[self.classes]
+        found = [
+            (taker, loser, float((owners[before == loser] == taker).mean()))
+            for loser in np.unique(before).tolist()
+            for taker in drawn - {loser}
+            if loser != marks.NOTHING
+        ]
+        most = max(found, key=lambda each: each[2], default=None)
+        return most if most is not None and most[2] > _NOTICEABLE else None
+
+    def say(self, text: str, kind: str = "INFO", passes: bool = False) -> None:
+        """Show a message on the marks instead of the earlier one; "" for none.
+
+        passes: it holds until the marks change.
+        """
         messages.withdraw(self.said)
-        self.said, self.said_problem = text, is_problem
+        self.said, self.said_passes = text, passes
         if text:
-            messages.show(text, "ERROR" if is_problem else "INFO")
+            messages.show(text, kind)
 
 
 _session: _Session | None = None
@@ -193,7 +224,7 @@ def share_of_splats() -> dict[int, int]:
 def refresh(root: bpy.types.Collection) -> None:
     """Ask for the objects of changed strokes, which may settle a problem of earlier ones."""
     if _session is not None and _session.root == root.session_uid:
-        if _session.said_problem:
+        if _session.said_passes:
             _session.say("")
         _session.ask(marks.content(root))
         show()
@@ -215,7 +246,7 @@ def _tick() -> float | None:
         if number is not None:
             marks.remove_stroke(root, number)
         if session.problem:
-            session.say(session.problem, is_problem=True)
+            session.say(session.problem, "ERROR", passes=True)
             session.problem = ""
     if session.ready and not was_ready:
         session.ask(marks.content(root))
@@ -223,6 +254,8 @@ def _tick() -> float | None:
             session.propose(session.wanted_detail)
     if session.proposed is not None:
         _show_proposed(root, session)
+    if session.taken is not None:
+        _tell_taken(root, session)
     if session.answered != before:
         show()
     if events:
@@ -236,6 +269,19 @@ def _tick() -> float | None:
         redraw()
         return None
     return INTERVAL
+
+
+def _tell_taken(root: bpy.types.Collection, session: _Session) -> None:
+    """Say that a stroke on one object has taken a part of another, which is easily overlooked."""
+    assert session.taken is not None
+    (taker, loser, share), session.taken = session.taken, None
+    names = {item.object_id: item.name for item in root.objectgs.marked}
+    if taker in names and loser in names:
+        session.say(
+            f"{names[taker]} took {100 * share:.0f} % of {names[loser]}; if it should not, draw over the lost part of "
+            f"{names[loser]} again",
+            passes=True,
+        )
 
 
 def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:

@@ -398,6 +398,36 @@ def test_a_problem_is_shown_until_the_marks_change(root, session, monkeypatch):
     assert not shown
 
 
+def test_a_stroke_that_takes_a_part_of_another_object_says_so(root, session, monkeypatch):
+    shown = {}
+    monkeypatch.setattr(messages, "show", lambda text, kind: shown.update({text: kind}))
+    monkeypatch.setattr(messages, "withdraw", lambda text: shown.pop(text, None))
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    root.objectgs.objects.clear()
+    place = views(root)[0]
+
+    def draw(object_id, counts):
+        """Draw over an object, after which objects 0, 1 and 2 have these numbers of splats, in this order."""
+        marks.add_stroke(root, object_id, place, [(1, 1)], area=False)
+        assert not shown
+        answer(session, [0, 1, 2], np.repeat([0, 1, 2], counts))
+        pointing._tick()
+
+    for object_id, name in ((1, "Box"), (2, "Vase")):
+        marks._add_row(root, object_id).name = name
+    draw(1, (0, 200, 0))
+    draw(2, (0, 192, 8))
+    assert not shown, "4 % is not noticeable"
+    draw(2, (0, 168, 32))
+    assert list(shown) == ["Vase took 12 % of Box; if it should not, draw over the lost part of Box again"]
+    draw(marks.NOTHING, (100, 68, 32))
+    assert not shown, "it was taken away on purpose"
+    marks.remove_stroke(root, 2)
+    answer(session, [0, 1, 2], np.repeat([0, 1, 2], (0, 0, 200)))
+    pointing._tick()
+    assert not shown, "nothing was drawn"
+
+
 @pytest.mark.parametrize(
     "change",
     [
