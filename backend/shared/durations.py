@@ -10,6 +10,11 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{whole % 60:02d}" if hours else f"{minutes}:{whole % 60:02d}"
 
 
+_STEPS = ((60.0, 5), (600.0, 15), (3600.0, 60), (float("inf"), 300))
+"""Up to which number of seconds an estimate is rounded to which step; it is not more exact than that."""
+
+
 def time_left(seconds: float) -> str:
     """Describe the estimated time until a job or step ends."""
-    return f"{clock(seconds)} left"
+    step = next(step for until, step in _STEPS if seconds <= until)
+    return f"{clock(max(step * round(seconds / step), step))} left"

@@ -7,6 +7,7 @@ With a window, a timer calls `JobQueue.poll`; without a window, `blocking.run_bl
 from __future__ import annotations
 
 import itertools
+import math
 import signal
 import sys
 import time
@@ -30,6 +31,9 @@ _MOST = 0.99
 _ESTIMATE_FROM = 0.02
 _ESTIMATE_AFTER = 1.0
 _ENDING_SECONDS = 3.0
+_SETTLING = 0.1
+_SETTLING_AT_MOST = 10.0
+"""How fast the shown time left follows the estimates: the time constant, relative to the time left and in seconds."""
 
 
 class State(StrEnum):
@@ -61,12 +65,12 @@ class Job:
         environment: additional environment variables.
         if_silent: error message if the program ends without any event, because it is not the expected program.
 
-    The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left
-    (reported or estimated), stage (such as "Preparing (1 of 3)", or empty), message (the current step), statuses
-    (all messages so far), warnings and error (sentences), lacks (a missing package and the option that needs it),
-    training figures (step, splats, anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest
-    image), curve (quality events: seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event),
-    exit_code and log (most recent lines that are not events). number identifies the job in this process.
+    The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left (reported
+    or estimated, without its jumps), stage (such as "Preparing (1 of 3)", or empty), message (the current step),
+    statuses (all messages so far), warnings and error (sentences), lacks (a missing package and the option that needs
+    it), training figures (step, splats, anchors, psnr, miou, miou_all, zero_is_background), preview (path of the
+    newest image), curve (quality events: seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done`
+    event), exit_code and log (most recent lines that are not events). number identifies the job in this process.
     """
 
     title: str
@@ -107,6 +111,7 @@ class Job:
     _done: bool = field(default=False, repr=False)
     _killed: bool = field(default=False, repr=False)
     _began: float = field(default=0.0, repr=False)
+    _estimated_at: float = field(default=0.0, repr=False)
     _paused_at: float | None = field(default=None, repr=False)
     _stop_asked: float | None = field(default=None, repr=False)
     _kill_at: float | None = field(default=None, repr=False)
@@ -228,7 +233,9 @@ class Job:
     def _shift_clock(self) -> None:
         """Exclude the pause from the elapsed time of the estimate."""
         if self._paused_at is not None:
-            self._began += time.monotonic() - self._paused_at
+            paused = time.monotonic() - self._paused_at
+            self._began += paused
+            self._estimated_at += paused
             self._paused_at = None
 
     def _take(self, event: dict[str, Any]) -> None:
@@ -266,10 +273,22 @@ class Job:
         if done is None or not total or total < 0:
             return
         self.progress = max(self.progress, min(max(done / total, 0.0), _MOST))
-        self.seconds_left = _number(event.get("seconds_left"))
+        left = _number(event.get("seconds_left"))
         elapsed = time.monotonic() - self._began
-        if self.seconds_left is None and self.progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
-            self.seconds_left = elapsed * (1 - self.progress) / self.progress
+        if left is None and self.progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
+            left = elapsed * (1 - self.progress) / self.progress
+        self.seconds_left = None if left is None else self._steady(max(left, 0.0))
+
+    def _steady(self, left: float) -> float:
+        """Return the time left without jumps: it counts down, and is drawn to the estimates, faster near the end."""
+        now, before = time.monotonic(), self.seconds_left
+        passed = max(now - self._estimated_at, 0.0)
+        self._estimated_at = now
+        if before is None:
+            return left
+        expected = max(before - passed, 0.0)
+        constant = min(max(_SETTLING * (left + expected) / 2, 1.0), _SETTLING_AT_MOST)
+        return left + (expected - left) * math.exp(-passed / constant)
 
     def _take_figures(self, event: dict[str, Any]) -> None:
         for name in ("step", "splats", "anchors", "psnr", "miou", "miou_all"):

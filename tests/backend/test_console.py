@@ -127,7 +127,7 @@ def test_terminal_bar_fits_width(monkeypatch):
     out.done()
     text = out.stream.getvalue()
     drawn = text.replace("\n", "\r").split("\r")
-    assert any(line.startswith("    0% |") and "1:01 left, loss 0.2500, 1,000 splats" in line for line in drawn)
+    assert any(line.startswith("    0% |") and "1:00 left, loss 0.2500, 1,000 splats" in line for line in drawn)
     assert any(re.fullmatch(r"  100% \|[█#]+\| loss 0.2500, 1,000 splats *", line) for line in drawn)
     assert all(len(line) <= 60 for line in drawn)
     assert text.endswith("\nDone.\n")

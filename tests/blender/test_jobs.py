@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from objectgs.backend.shared.events import Reporter
 from objectgs.objectgs_addon.process import jobs
@@ -401,11 +402,39 @@ def test_missing_time_left_is_estimated(make, monkeypatch):
     clock[0] += 10
     job._take({"type": "progress", "done": 1, "total": 4})
     assert job.seconds_left == pytest.approx(30)
+    clock[0] += 60
     job._take({"type": "progress", "done": 2, "total": 4, "seconds_left": 7})
-    assert job.seconds_left == 7
-    clock[0] += 5
-    job._take({"type": "progress", "done": 6, "total": 10})
-    assert job.seconds_left == pytest.approx(10)
+    assert job.seconds_left == pytest.approx(7)
+    clock[0] += 70
+    job._take({"type": "progress", "done": 7, "total": 10})
+    assert job.seconds_left == pytest.approx(60, abs=0.1)
+
+
+def test_time_left_is_steady_but_follows_the_truth(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: clock[0])
+    job = Job(title="", kind="train", folder=None, command=[], cwd=Path(), state=State.RUNNING)
+
+    def run(seconds, left):
+        """Return what is shown in each second; left: what is reported, by the seconds of this run."""
+        shown = []
+        for second in range(seconds):
+            job._take({"type": "progress", "done": 0.5, "total": 1.0, "seconds_left": left(second)})
+            shown.append(job.seconds_left)
+            clock[0] += 1
+        return np.array(shown)
+
+    jumping = run(100, lambda second: (200 - second) * (1.0 + (0.4, -0.4)[second % 2]))
+    assert np.abs(np.diff(jumping[20:])).max() < 15, "reported are jumps of 80 to 160 seconds"
+    assert abs(jumping[-1] - 101) < 15
+    longer = run(40, lambda second: 400 - second)
+    assert abs(longer[-1] - 361) < 361 * 0.05, "a job that takes longer than expected is said to"
+    ending = run(40, lambda second: 40 - second)
+    assert abs(ending[-10:] - np.arange(10, 0, -1)).max() < 2, "near the end it is exact"
+    job.state, job._paused_at = State.PAUSED, clock[0]
+    clock[0] += 1000
+    job._shift_clock()
+    assert run(1, lambda _second: 60)[0] < 20, "the pause is not a time in which the estimates are followed"
 
 
 def test_stages_are_named_and_progress_only_rises():
