@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...backend.shared.reconstruction.lock import lock_holder
 from .. import scene
 from ..running import background
 from ..running.job_display import write
@@ -34,6 +35,14 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         column.prop(properties, "mesh_scene")
         if job is not None and job.kind == "mesh":
             draw_job_of(layout, job)
+        elif state.waiting_meshes and lock_holder(folder) is None:
+            count = state.waiting_meshes
+            write(
+                layout,
+                f"Meshing was interrupted, and {count} mesh{'es are' if count > 1 else ' is'} missing. "
+                "Extract Meshes continues it.",
+                "INFO",
+            )
         if state.stale_meshes and not background.busy(folder):
             write(
                 layout,

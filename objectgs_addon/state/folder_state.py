@@ -10,7 +10,7 @@ from ...backend.shared.reconstruction.cameras import read_cameras
 from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeader, read_header
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
-from ...backend.shared.reconstruction.meshes import read_meshes
+from ...backend.shared.reconstruction.meshes import read_meshes, read_waiting
 from ...backend.shared.reconstruction.record import Record, read_record
 
 
@@ -32,6 +32,7 @@ class FolderState:
         agreement: how well the photos agree, in dB, or None.
         meshes: number of meshes.
         stale_meshes: number of meshes made at another training step than the checkpoint's.
+        waiting_meshes: number of meshes that a job is to make, or was when it was interrupted.
         quality, zero_is_background: of the checkpoint's header.
     """
 
@@ -48,6 +49,7 @@ class FolderState:
     unfinished: bool = False
     outdated: bool = False
     agreement: float | None = None
+    waiting_meshes: int = 0
     quality: Mapping[str, float] = field(default_factory=dict)
     zero_is_background: bool = False
 
@@ -117,6 +119,7 @@ def folder_state(folder: Path) -> FolderState:
         unfinished=header.steps > 0 and _is_unfinished(record, header),
         outdated=header.steps > 0 and _is_outdated(record),
         agreement=None if record.capture is None else record.capture.agreement,
+        waiting_meshes=len(read_waiting(paths.meshes)),
         quality=header.quality,
         zero_is_background=header.zero_is_background,
     )

@@ -14,6 +14,7 @@ from backend.commands.objects import mesh as command
 from backend.mesh.surface import NoSurface
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
 from backend.shared.formats.mesh_ply import read_mesh
+from backend.shared.reconstruction.meshes import read_waiting
 from backend.shared.reconstruction.objects import edit_objects
 
 from .command_result import assert_rejected
@@ -129,9 +130,10 @@ def test_existing_meshes_are_not_made_again(trained, run_command, monkeypatch):
     first = Stub(monkeypatch, stop_at=2)
     assert run_command("mesh", trained).code == EXIT_CANCELLED and first.made == ["1", "2"]
     assert set(entries(trained)) == {"1", "2"} and not (trained / ".lock").exists()
+    assert read_waiting(trained / "meshes") == ["5"], "an interrupted job leaves what it was to make"
     second = Stub(monkeypatch)
     assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5"]
-    assert set(entries(trained)) == {"1", "2", "5"}
+    assert set(entries(trained)) == {"1", "2", "5"} and not read_waiting(trained / "meshes")
     assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5"], "all meshes exist"
     (trained / "meshes" / "2.png").unlink()
     assert run_command("mesh", trained).code == EXIT_DONE and second.made == ["5", "2"]
@@ -141,6 +143,17 @@ def test_existing_meshes_are_not_made_again(trained, run_command, monkeypatch):
         "2",
         "5",
     ]
+
+
+def test_a_job_that_ends_before_its_first_mesh_leaves_all_of_them(trained, run_command, monkeypatch):
+    Stub(monkeypatch, stop_at=0)
+    assert run_command("mesh", trained, "--objects", "1", "5").code == EXIT_CANCELLED
+    assert not entries(trained) and read_waiting(trained / "meshes") == ["1", "5"]
+    Stub(monkeypatch)
+    assert run_command("mesh", trained, "--objects", "1").code == EXIT_DONE
+    assert not read_waiting(trained / "meshes"), "it is the latest job that counts"
+    (trained / "meshes" / "meshes.json").write_text('{"waiting": 5, "meshes": {}}')
+    assert not read_waiting(trained / "meshes")
 
 
 def test_further_training_outdates_meshes(trained, kept, run_command, monkeypatch):

@@ -12,6 +12,7 @@ import pytest
 from mathutils import Matrix
 from objectgs.backend.shared.errors import InputError
 from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.reconstruction.lock import locked
 from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.objectgs_addon import panels
 from objectgs.objectgs_addon import scene as blender_scene
@@ -23,6 +24,7 @@ from objectgs.objectgs_addon.state.folder_state import folder_state
 import headless
 
 from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
+from .drawn import texts_of
 
 ORIGIN = np.array([1000.0, -2000.0, 30.0])
 
@@ -591,6 +593,17 @@ def test_finished_job_shows_meshes(active, folder, monkeypatch):
     properties.shown = "both"
     background.finish(job)
     assert properties.shown == "both", "the user's choice is kept if it includes meshes"
+
+
+def test_interrupted_meshing_is_named_after_reopening(active):
+    folder = blender_scene.folder_of(active)
+    path = folder / "meshes" / "meshes.json"
+    kept = json.loads(path.read_text())
+    assert "interrupted" not in texts_of(panels.meshes.MeshesPanel)
+    path.write_text(json.dumps({**kept, "waiting": ["5", "6"]}))
+    assert "interrupted, and 2 meshes are missing. Extract Meshes continues" in texts_of(panels.meshes.MeshesPanel)
+    with locked(folder):
+        assert "interrupted" not in texts_of(panels.meshes.MeshesPanel), "another program makes them"
 
 
 def test_folder_state_counts_outdated_meshes(folder):

@@ -28,7 +28,7 @@ from ...shared.formats.file_names import hashed_stem
 from ...shared.formats.mesh_ply import Mesh, write_mesh
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import locked
-from ...shared.reconstruction.meshes import MeshEntry, read_meshes, write_meshes
+from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
@@ -73,6 +73,9 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         folder.meshes.mkdir(exist_ok=True)
         known = {} if options.restart else _known_meshes(folder)
         wanted = [target for target in targets if not _is_current(known.get(target.key), target, options, trained)]
+        waiting = [target.key for target in wanted]
+        if wanted or read_waiting(folder.meshes):
+            write_meshes(folder.meshes, _known_meshes(folder), trained.progress.step, waiting)
         discs = seconds_of_discs(trained) if wanted else 0.0
         reporter.expect({DISCS: ("Fitting discs", discs), "meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
         model = model_of_discs(trained, options, reporter) if wanted else trained.model
@@ -87,7 +90,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             if entry.why:
                 reporter.warning(entry.why)
             known = {**_known_meshes(folder), target.key: entry}
-            write_meshes(folder.meshes, known, trained.progress.step)
+            write_meshes(folder.meshes, known, trained.progress.step, waiting[done + 1 :])
         if wanted:
             finish_stage(folder, "mesh", time.monotonic() - started)
     made = [target.key for target in targets if target.key in known and known[target.key].file]

@@ -4,12 +4,15 @@
  "meshes": {"1": {"name": "mug", "ids": [1], "trained_steps": 2000, "settings": {"faces": 20000, ...},
                   "file": "1.ply", "texture": "1.png", "vertices": 9998, "faces": 20000, "watertight": true, ...},
             "3": {"name": "box", "ids": [3], ..., "why": "box has no splats."},
-            "scene": {"name": "the whole scene", "ids": null, ...}}}
+            "scene": {"name": "the whole scene", "ids": null, ...}},
+ "waiting": ["4"]}
+
+"waiting" are the keys of meshes that a job is still to make; one that was interrupted leaves them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -90,10 +93,30 @@ def read_meshes(folder: Path) -> dict[str, MeshEntry]:
         ) from error
 
 
-def write_meshes(folder: Path, entries: Mapping[str, MeshEntry], trained_steps: int | None) -> None:
-    """Write meshes.json to `folder`; trained_steps: training steps of the model of the latest meshes, if known."""
+def read_waiting(folder: Path) -> list[str]:
+    """Return the keys of the meshes that a job in `folder` was still to make; none if meshes.json is invalid."""
+    path = folder / NAME
+    try:
+        waiting = read_json(path).get("waiting") if path.exists() else None
+    except (InputError, AttributeError):
+        return []
+    return [str(key) for key in waiting] if isinstance(waiting, list) else []
+
+
+def write_meshes(
+    folder: Path, entries: Mapping[str, MeshEntry], trained_steps: int | None, waiting: Sequence[str] = ()
+) -> None:
+    """Write meshes.json.
+
+    Args:
+        folder: The `meshes` folder of a reconstruction.
+        entries: The entries by key.
+        trained_steps: Training steps of the model of the latest meshes, if known.
+        waiting: Keys of the meshes that are still to be made.
+    """
     meshes = {key: entries[key].as_dict() for key in sorted(entries)}
-    write_json(folder / NAME, plain({"trained_steps": trained_steps, "meshes": meshes}))
+    content = {"trained_steps": trained_steps, "meshes": meshes, **({"waiting": list(waiting)} if waiting else {})}
+    write_json(folder / NAME, plain(content))
 
 
 def outdate_meshes(folder: Path, objects: Container[int]) -> None:
