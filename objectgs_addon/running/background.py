@@ -71,7 +71,7 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
         The return value for the operator's `execute`.
     """
     _submitted_in[job] = owner.session_uid
-    pointing.release(job.folder)
+    pointing.release(job.folder, keeps_colors=job.kind == "label" and not bpy.app.background)
     if bpy.app.background:
         run_blocking(job, ConsoleReporter())
         if job.state is not State.DONE:
@@ -187,6 +187,8 @@ def redraw() -> None:
 
 
 def _handle_end(job: Job) -> None:
+    if job.kind == "label":
+        pointing.separated()
     operator, label, options = _remedy(job)
     if job.state is State.FAILED and job.lacks is not None and job.lacks[0] == TRANSFORMERS:
         messages.show(f"{job.title}: {lacking(*job.lacks)}", "ERROR", *INSTALL, number=job.number)

@@ -151,6 +151,8 @@ class _Session:
 
 
 _session: _Session | None = None
+_keeps_colors = False
+"""Whether the splats keep the colors of the marks while a job separates the objects."""
 
 
 def start(root: bpy.types.Collection) -> None:
@@ -173,14 +175,32 @@ def start(root: bpy.types.Collection) -> None:
 
 def stop() -> None:
     """End the process, and show the splats in their own colors."""
+    if _end() or _keeps_colors:
+        _show_own_colors()
+
+
+def separated() -> None:
+    """Show the splats in their own colors again after a job before which `release` has kept those of the marks."""
+    if _keeps_colors:
+        _show_own_colors()
+
+
+def _show_own_colors() -> None:
+    global _keeps_colors
+    _keeps_colors = False
+    drawing.show_labels({}, np.zeros((0, 3)))
+    drawing.redraw()
+
+
+def _end() -> bool:
+    """End the process; return whether it ran."""
     global _session
     if _session is None:
-        return
+        return False
     _session.process.kill()
     _session.say("")
     _session = None
-    drawing.show_labels({}, np.zeros((0, 3)))
-    drawing.redraw()
+    return True
 
 
 def propose(root: bpy.types.Collection) -> None:
@@ -190,9 +210,17 @@ def propose(root: bpy.types.Collection) -> None:
     _session.propose(root.objectgs.detail)
 
 
-def release(folder: Path | None) -> None:
-    """End the process if it reads this folder, which a job is going to change."""
-    if _session is not None and folder is not None and _session.folder == folder:
+def release(folder: Path | None, keeps_colors: bool = False) -> None:
+    """End the process if it reads this folder, which a job is going to change.
+
+    keeps_colors: the marked splats are drawn in the colors of their objects until `separated`.
+    """
+    global _keeps_colors
+    if _session is None or folder is None or _session.folder != folder:
+        return
+    if keeps_colors:
+        _keeps_colors = _end()
+    else:
         stop()
 
 

@@ -21,6 +21,7 @@ from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.picking import marks
+from objectgs.objectgs_addon.process.jobs import State
 from objectgs.objectgs_addon.running import background, pointing
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
@@ -299,6 +300,30 @@ def test_answers_are_shown_and_end_with_the_strokes(root, session):
     assert pointing.share_of_splats() == {3: count} and pointing.state() == (1.0, False)
     marks.clear(root)
     assert pointing.share_of_splats() == {0: count} and not pointing.state()[1]
+
+
+@pytest.mark.parametrize("state", [State.DONE, State.STOPPED, State.FAILED])
+def test_marks_stay_in_the_viewport_while_their_objects_are_separated(root, session, monkeypatch, state):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    marks.add_object(root)
+    marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
+    answer(session, [3], [0] * len(session.keys))
+    pointing.show()
+
+    def are_colored():
+        return any(obj.labels is not None for obj in gather(placed_parts(bpy.context.view_layer)))
+
+    app = SimpleNamespace(background=False, timers=SimpleNamespace(is_registered=lambda _function: True))
+    job = locations.backend_job("Objects", "label", blender_scene.folder_of(root), "label")
+    with monkeypatch.context() as patched:
+        patched.setattr(background, "bpy", SimpleNamespace(app=app))
+        background.submit(job, bpy.context.scene, print)
+    assert not pointing.is_active(root) and are_colored()
+    background.queue.jobs.remove(job)
+    job.state = state
+    background._handle_end(job)
+    background._results.clear()
+    assert not are_colored()
 
 
 def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatch, tmp_path):
