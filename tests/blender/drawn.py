@@ -20,6 +20,8 @@ class _Layout:
     def __getattr__(self, name: str) -> Any:
         if name in ("row", "column", "box", "split", "column_flow", "grid_flow"):
             return lambda **_: self
+        if name == "panel":
+            return lambda _name, default_closed=False: (self, None if default_closed else self)
         return lambda *words, **named: self._add(name, words, named)
 
     def _add(self, name: str, words: tuple, named: dict[str, Any]) -> SimpleNamespace:

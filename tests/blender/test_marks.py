@@ -20,6 +20,7 @@ from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.drawing import splat_arrays
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.panels.objects import MarkingPanel
 from objectgs.objectgs_addon.picking import marks
 from objectgs.objectgs_addon.process.jobs import State
 from objectgs.objectgs_addon.running import background, pointing
@@ -31,6 +32,7 @@ from objectgs.operators.common import need, path
 import headless
 
 from .building import OBJECTS, look_at, splat_table, write_cameras, write_folder
+from .drawn import texts_of
 
 ORIGIN = np.array([100.0, -200.0, 30.0])
 PLACE = ORIGIN + np.array([0.1, -0.3, 0.2])
@@ -324,6 +326,17 @@ def test_marks_stay_in_the_viewport_while_their_objects_are_separated(root, sess
     background._handle_end(job)
     background._results.clear()
     assert not are_colored()
+
+
+def test_one_list_of_objects_is_open(root, session):
+    """Once the objects are separated, the list of the marked ones has the same names, unless they are being marked."""
+    marks.add_object(root)
+    assert "OBJECTGS_UL_marked" in texts_of(MarkingPanel)
+    pointing.stop()
+    assert "OBJECTGS_UL_marked" not in texts_of(MarkingPanel)
+    assert "Marked Objects" in texts_of(MarkingPanel) and "objectgs.separate_marked" in texts_of(MarkingPanel)
+    root.objectgs.objects.clear()
+    assert "OBJECTGS_UL_marked" in texts_of(MarkingPanel)
 
 
 def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatch, tmp_path):

@@ -79,14 +79,14 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             self._draw_state(layout, root)
         if (model := locations.segmenter()) is not None:
             write(layout, f"A stroke marks all that {model.name} segments by it.", "INFO")
-        row = layout.row()
-        row.template_list("OBJECTGS_UL_marked", "", properties, "marked", properties, "active_marked", rows=4)
-        column = row.column(align=True)
-        column.operator("objectgs.add_marked_object", text="", icon="ADD")
-        column.operator("objectgs.remove_marked_object", text="", icon="REMOVE")
-        column.operator("objectgs.merge_marked", text="", icon="AUTOMERGE_ON")
-        column.separator()
-        column.operator("objectgs.clear_marks", text="", icon="TRASH")
+        if is_active or not properties.objects:
+            _draw_list(layout, properties)
+        else:
+            # The list of objects above has the same names.
+            header, body = layout.panel("OBJECTGS_marked", default_closed=True)
+            header.label(text="Marked Objects")
+            if body is not None:
+                _draw_list(body, properties)
         if is_active:
             _draw_suggesting(layout, properties)
         layout.prop(properties, "everything")
@@ -112,6 +112,17 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
         write(layout, text, "INFO", rows=_ROWS)
+
+
+def _draw_list(layout: bpy.types.UILayout, properties: Any) -> None:
+    row = layout.row()
+    row.template_list("OBJECTGS_UL_marked", "", properties, "marked", properties, "active_marked", rows=4)
+    column = row.column(align=True)
+    column.operator("objectgs.add_marked_object", text="", icon="ADD")
+    column.operator("objectgs.remove_marked_object", text="", icon="REMOVE")
+    column.operator("objectgs.merge_marked", text="", icon="AUTOMERGE_ON")
+    column.separator()
+    column.operator("objectgs.clear_marks", text="", icon="TRASH")
 
 
 def _draw_suggesting(layout: bpy.types.UILayout, properties: Any) -> None:
