@@ -175,6 +175,21 @@ def test_starts_of_jobs_are_undo_steps_that_are_not_repeated():
         assert "UNDO" in options[f"objectgs.{name}"] and "REGISTER" not in options[f"objectgs.{name}"]
 
 
+def test_undo_after_the_start_of_a_training_keeps_the_import(extension, folder, backend_python, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", backend_python)
+    monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
+    bpy.ops.ed.undo_push(message="Empty")
+    for operator, options in (
+        (bpy.ops.objectgs.open_reconstruction, {"directory": str(folder)}),
+        (bpy.ops.objectgs.train, {}),
+    ):
+        assert operator("EXEC_DEFAULT", True, **options) == {"FINISHED"}
+    bpy.ops.ed.undo()
+    assert bpy.context.scene.objectgs.active is not None, "the start of the training was undone"
+    bpy.ops.ed.undo()
+    assert bpy.context.scene.objectgs.active is None
+
+
 def test_disabled_imports_say_that_the_backend_is_being_set_up(extension, tmp_path):
     place = locations.environment_folder()
     start(job(tmp_path, UNTIL_STOPPED, kind="setup", folder=place), bpy.context.scene)
