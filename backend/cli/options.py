@@ -70,7 +70,7 @@ def add_vote(command: argparse.ArgumentParser, out_required: bool = True) -> Non
         "point (majority)",
     )  # fmt: skip
     command.add_argument(
-        "--seed", type=types.seed, default=0, metavar="N", help="random seed; the same seed gives the same result (0)"
+        "--seed", type=types.index, default=0, metavar="N", help="random seed; the same seed gives the same result (0)"
     )
     command.add_argument(
         "--only", nargs="+", metavar="OBJECT",
@@ -95,6 +95,10 @@ def add_length(command: argparse.ArgumentParser) -> None:
         f"{PRESET_STEPS['standard']} steps; final, until it converges on validation views",
     )  # fmt: skip
     command.add_argument("--restart", action="store_true", help="discard an earlier training in DIR")
+    add_checkpoint_seconds(command)
+
+
+def add_checkpoint_seconds(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--checkpoint-seconds", type=types.amount, default=30.0, metavar="S",
         help="time between checkpoints in seconds (30)",

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import NoReturn
 
-from ..shared.defaults import DETAIL
+from ..shared.defaults import DETAIL, OVERLAP
 from ..shared.version import __version__
 from . import options, texts, types
 
@@ -38,6 +38,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = _Commands(parser)
     _add_capture_commands(commands)
     _add_training_commands(commands)
+    _add_cells(commands)
     _add_label(commands)
     _add_render(commands)
     _add_mesh(commands)
@@ -159,6 +160,36 @@ def _add_training_commands(commands: _Commands) -> None:
         options.add_length(command)
         options.add_splats(command)
         options.add_plan_overrides(command)
+
+
+def _add_cells(commands: _Commands) -> None:
+    """Add `split`, `train-cell` and `merge`."""
+    split = commands.add_for_result(
+        "split", "Divide a large model into cells to train one by one", texts.SPLIT, "town-splats --cells 4"
+    )
+    split.add_argument("--cells", type=types.several, required=True, metavar="N", help="number of cells, at least 2")
+    split.add_argument(
+        "--overlap", type=types.fraction, default=OVERLAP, metavar="NUMBER",
+        help=f"how far neighboring cells reach into each other, relative to their size ({OVERLAP:g})",
+    )  # fmt: skip
+    split.add_argument("--restart", action="store_true", help="discard cells of an earlier division")
+    cell = commands.add_for_result(
+        "train-cell", "Train one cell", texts.TRAIN_CELL, "town-splats --cell 0 --minutes 20"
+    )
+    cell.add_argument("--cell", type=types.index, required=True, metavar="N", help="number of the cell, from 0 on")
+    length = cell.add_mutually_exclusive_group()
+    length.add_argument("--minutes", type=types.amount, metavar="M", help="total training time of the cell in minutes")
+    length.add_argument(
+        "--steps", type=types.count, metavar="N",
+        help="total number of training steps of the cell (default: as many as the divided model has)",
+    )  # fmt: skip
+    cell.add_argument("--restart", action="store_true", help="discard an earlier training of the cell")
+    options.add_checkpoint_seconds(cell)
+    merge = commands.add_for_result("merge", "Join the trained cells", texts.MERGE, "town-splats")
+    merge.add_argument(
+        "--steps", type=types.count, metavar="N",
+        help="number of training steps where cells meet (default: a twentieth of those of all cells, at most 2000)",
+    )  # fmt: skip
 
 
 def _add_label(commands: _Commands) -> None:

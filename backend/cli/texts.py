@@ -89,6 +89,25 @@ keeps the mean of its latest steps. To train longer, run the command again with 
 --minutes or --steps.
 """
 
+SPLIT = """\
+Divide a trained model into cells that are trained further one by one, so that each
+takes a part of the memory, or by several machines at the same time. Train a coarse
+model of the whole capture first. Then run `split`, `train-cell` for each cell in any
+order, and `merge`. Writes DIR/cells. Machines that train cells need DIR and the
+capture, and write only to the folder of their cell.
+"""
+
+TRAIN_CELL = """\
+Train one cell of a divided model further. What its photos show around it stays as it
+is. After a stop, run the same command again to go on.
+"""
+
+MERGE = """\
+Join the trained cells of a divided model, and train a little more where they meet.
+Replaces the checkpoint and splats.ply of the reconstruction; meshes have to be made
+again. After a stop, run the same command again to go on.
+"""
+
 PROPOSE = """\
 Find the objects of splats without masks: large planes, what stands on them, and splats
 with concave borders or gaps around them, such as things on a table, the table and the

@@ -25,6 +25,14 @@ def count(text: str) -> int:
     return integer(text, 1, "above 0")
 
 
+def several(text: str) -> int:
+    return integer(text, 2, "of at least 2")
+
+
+def index(text: str) -> int:
+    return integer(text, 0, "of at least 0")
+
+
 def faces(text: str) -> int:
     return integer(text, 100, "of at least 100")
 
@@ -98,10 +106,6 @@ def placement(text: str) -> tuple[str, dict[str, float]]:
     if values.get("scale", 1.0) <= 0:
         raise argparse.ArgumentTypeError(f"scale={given['scale']} is not a number above 0")
     return word, values
-
-
-def seed(text: str) -> int:
-    return integer(text, 0, "of at least 0")
 
 
 def weight(text: str) -> float:

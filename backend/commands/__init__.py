@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from ..shared.stopping import StoppingReporter
 from .capture import check, import_capture, import_splats, masks, plan, sfm, vote
+from .cells import merge, split, train_cell
 from .objects import clean_labels, edit, export, film, label, mesh, point, propose
 from .setup import doctor
 from .training import evaluate, render, report, train
@@ -22,6 +23,9 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
     "plan": plan.plan,
     "vote": vote.vote,
     "train": train.train,
+    "split": split.split,
+    "train-cell": train_cell.train_cell,
+    "merge": merge.merge,
     "propose": propose.propose,
     "label": label.label,
     "clean-labels": clean_labels.clean_labels,

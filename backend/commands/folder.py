@@ -148,12 +148,13 @@ class Trained(NamedTuple):
         return self.training.device
 
 
-def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
+def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Path | None = None) -> Trained:
     """Open a trained reconstruction with its capture.
 
     Args:
         options: Options with the folder, and the device to load the model on; `capture` replaces a recorded folder.
         reporter: Receives status and warnings.
+        checkpoint: Folder of the checkpoint; None: that of the reconstruction.
 
     Returns:
         The reconstruction, with the capture edited and planned as for its training.
@@ -171,7 +172,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter) -> Trained:
             f"{folder.folder} is not a reconstruction, since it has no {folder.settings.name}; train first."
         )
     record = read_record(folder)
-    model, state, warning = load_model(folder.checkpoint, device)
+    model, state, warning = load_model(checkpoint or folder.checkpoint, device)
     if warning:
         reporter.warning(warning)
     training = record.training

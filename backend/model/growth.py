@@ -10,6 +10,7 @@ anchors whose splats request a cell are copied to the CPU.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,6 +129,8 @@ def grow_and_prune(
     threshold: float = 2e-4,
     min_opacity: float = 0.005,
     max_anchors: int = 10**9,
+    fixed: int = 0,
+    allows: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Growth:
     """Add anchors where splats have large gradients and remove transparent ones, in place (Scaffold-GS section 3.3).
 
@@ -139,7 +142,9 @@ def grow_and_prune(
         rng: generator of the offsets of new anchors.
         threshold: average norm of the screen gradient.
         min_opacity: anchors are removed if the total opacity of their splats, averaged over views, is smaller.
-        max_anchors: no anchors are added beyond this number.
+        max_anchors: no anchors are added beyond this number, not counting fixed ones.
+        fixed: number of anchors, the first ones, that neither grow nor are removed.
+        allows: returns for positions (n, 3) where anchors may be added, (n,) bool; None: everywhere.
 
     Returns:
         The changes.
@@ -151,6 +156,7 @@ def grow_and_prune(
     positions = devices.host(anchors.positions)
     enough = visits >= MIN_VISITS
     gradient = np.where(enough, summed / np.maximum(visits, 1), 0)
+    gradient[: fixed * k] = 0
     wanted = np.flatnonzero(gradient >= threshold)
     parents = wanted // k
     axes = np.arange(3)
@@ -164,7 +170,7 @@ def grow_and_prune(
     means = positions[parents] + numbers[:, :3] * np.exp(numbers[:, 3:])
 
     new_positions, new_children, new_extents = [], [], []
-    remaining = max_anchors - len(anchors)
+    remaining = max_anchors - (len(anchors) - fixed)
     occupied_by = [positions]
     for level, voxels in enumerate(LEVELS):
         cell = anchors.voxel * voxels
@@ -173,6 +179,8 @@ def grow_and_prune(
         taken = cell_keys(np.concatenate(occupied_by), cell)
         cells = _numbered(np.concatenate([taken, keys]))
         free = ~np.isin(cells[len(taken) :], cells[: len(taken)])
+        if allows is not None:
+            free &= allows(keys * cell)
         index = np.flatnonzero(here)[free]
         keys, cells = keys[free], cells[len(taken) :][free]
         # The largest accumulated gradient first; ties are broken by index, so that the result is deterministic.
@@ -196,6 +204,7 @@ def grow_and_prune(
     rows[:, layout.color_columns] = np.tile(colors, (1, k))
 
     faint = (views >= MIN_VISITS) & (opacity < min_opacity * np.maximum(views, 1))
+    faint[:fixed] = False
     kept = devices.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
     added_positions = devices.upload(np.concatenate(new_positions), anchors.rows)

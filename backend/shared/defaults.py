@@ -5,3 +5,6 @@ MAX_SIZE = 1600
 
 DETAIL = 0.45
 """How finely scenes are divided into suggested objects: the fraction of the trials that must agree on two being one."""
+
+OVERLAP = 0.2
+"""How far cells of a divided model reach into each other, relative to their size."""

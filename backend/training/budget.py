@@ -98,8 +98,8 @@ class Budget:
 
     until_converged: train until further steps would gain little on the validation views; `seconds` is then a limit,
     None: no limit.
-    first, first_step: progress at the first of `steps`, for a model that was trained before, and the number of that
-        step.
+    first, first_step: progress at the start, for a model that was trained before, and with `steps` the number of its
+        first step.
     """
 
     steps: int | None = None
@@ -126,7 +126,7 @@ class Budget:
             done = (p.step - self.first_step) / max(self.steps - self.first_step, 1)
             return min(self.first + (1.0 - self.first) * done, 1.0)
         assert self.seconds is not None
-        return min(p.seconds / self.seconds, 1.0)
+        return min(self.first + (1.0 - self.first) * p.seconds / self.seconds, 1.0)
 
     def remaining(self, p: TrainingProgress, pace: float) -> float | None:
         """Estimate the remaining seconds.

@@ -10,6 +10,7 @@ import torch
 
 from ..model.growth import Growth, GrowthStatistics, grow_and_prune
 from ..model.object_model import ObjectModel
+from .cells.region import Region
 from .settings import GROW_FROM, GROW_UNTIL, Settings, growth_interval
 
 
@@ -51,8 +52,9 @@ class ViewStatistics(NamedTuple):
 class GrowthStrategy:
     """Accumulates statistics of the training views, and grows and prunes anchors at intervals."""
 
-    def __init__(self, settings: Settings, model: ObjectModel) -> None:
+    def __init__(self, settings: Settings, model: ObjectModel, region: Region) -> None:
         self._settings = settings
+        self._region = region
         self.statistics = self._cleared(model)
 
     def observes(self, progress: float) -> bool:
@@ -87,7 +89,11 @@ class GrowthStrategy:
     def grow(self, model: ObjectModel, rng: np.random.Generator) -> Growth:
         """Grow and prune the model's anchors in place, based on the accumulated statistics."""
         anchors = model.anchors
-        growth = grow_and_prune(anchors, self.statistics, rng, max_anchors=self._settings.max_anchors)
+        region = self._region
+        growth = grow_and_prune(
+            anchors, self.statistics, rng, max_anchors=self._settings.max_anchors, fixed=region.fixed,
+            allows=None if region.is_whole else region.contains,
+        )  # fmt: skip
         self.statistics = self.statistics.after(growth, anchors.layout.offsets)
         return growth
 

@@ -22,9 +22,11 @@ from ..shared.errors import InputError
 from ..shared.formats.typed import typed
 from ..shared.reconstruction.objects import LARGEST_ID
 from .budget import TrainingProgress
+from .cells.region import Region
 from .exposure.photo_colors import PhotoColors
 from .optimizer.average import Average
 from .optimizer.head_adam import MOMENTS, STEP, HeadAdam, checkpoint_name
+from .optimizer.row_adam import RowAdam
 from .settings import HEAD_RATES, MODES, Settings
 
 _GROWTH = ("gradient", "visits", "opacity", "views")
@@ -64,24 +66,19 @@ def _renamed(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> tuple[dic
 
 def training_tensors(
     model: ObjectModel,
-    exp_avg: torch.Tensor,
-    exp_avg_sq: torch.Tensor,
+    row_optimizer: RowAdam,
     statistics: GrowthStatistics,
     average: Average,
     head_optimizer: HeadAdam,
     colors: PhotoColors | None,
 ) -> dict[str, np.ndarray]:
-    """Return all tensors that the next step depends on, by their names in a checkpoint.
-
-    exp_avg, exp_avg_sq: (N, columns), Adam's moments of the anchors' rows.
-    """
+    """Return all tensors that the next step depends on, by their names in a checkpoint."""
     anchors = model.anchors
     tensors: dict[str, torch.Tensor | np.ndarray] = {
         "anchors.positions": anchors.positions,
         "anchors.rows": anchors.rows,
         "anchors.ids": anchors.ids,
-        "adam.exp_avg": exp_avg,
-        "adam.exp_avg_sq": exp_avg_sq,
+        **row_optimizer.tensors(),
         **{f"growth.{name}": getattr(statistics, name) for name in _GROWTH},
         "object_ids": model.classes.ids,
         "background": model.background,
@@ -94,7 +91,12 @@ def training_tensors(
 
 
 def training_state(
-    settings: Settings, model: ObjectModel, supervise_background: bool, rng: np.random.Generator, p: TrainingProgress
+    settings: Settings,
+    model: ObjectModel,
+    supervise_background: bool,
+    rng: np.random.Generator,
+    p: TrainingProgress,
+    region: Region,
 ) -> dict[str, Any]:
     """Return what a checkpoint contains beside its tensors, as JSON."""
     return {
@@ -104,6 +106,7 @@ def training_state(
         "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
         "rng": rng.bit_generator.state,
         "progress": {**p.__dict__},
+        **({} if region.is_whole else {"region": region.as_dict()}),
     }
 
 
@@ -119,21 +122,16 @@ def require_settings(wanted: Settings, state: dict[str, Any], folder: Path) -> N
 
 
 def restore_statistics(tensors: dict[str, np.ndarray], device: torch.device) -> GrowthStatistics:
-    """Return the growth statistics in a checkpoint's tensors."""
-    return GrowthStatistics(*(restore_tensor(tensors, f"growth.{name}", device) for name in _GROWTH))
-
-
-def restore_tensor(tensors: dict[str, np.ndarray], name: str, device: torch.device) -> torch.Tensor:
-    """Return a copy of a checkpoint's tensor on `device`."""
-    return torch.from_numpy(tensors[name].copy()).to(device)
+    """Return the growth statistics in a checkpoint's tensors; on the CPU, they share their memory."""
+    return GrowthStatistics(*(torch.from_numpy(tensors[f"growth.{name}"]).to(device) for name in _GROWTH))
 
 
 def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> ObjectModel:
-    """Return the model stored in a checkpoint's tensors and state."""
+    """Return the model stored in a checkpoint's tensors and state; its anchors share their memory with the tensors."""
     settings = Settings(**state["settings"])
     anchors = Anchors(
         settings.layout, float(state["voxel"]),
-        *(torch.from_numpy(tensors[f"anchors.{n}"].copy()) for n in ("positions", "rows", "ids")),
+        *(torch.from_numpy(tensors[f"anchors.{n}"]) for n in ("positions", "rows", "ids")),
     )  # fmt: skip
     heads = Heads(settings.layout, settings.mode, settings.sh_degree, torch.Generator())
     heads.load_state_dict(
@@ -170,7 +168,7 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     """
     tensors, state, warning = require_checkpoint(folder)
     model = model_from_checkpoint(tensors, state)
-    return Average.from_checkpoint(tensors, model).of(model).to(device), state, warning
+    return Average.from_checkpoint(tensors, model, Region.of(state).fixed).of(model).to(device), state, warning
 
 
 def progress_of(state: dict[str, Any]) -> TrainingProgress:
@@ -191,13 +189,14 @@ def _check_training(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> No
     _check_state(settings, state)
     columns, k = settings.layout.columns, settings.offsets
     count, classes = len(tensors["anchors.positions"]), len(tensors["object_ids"])
+    trained = count - Region.of(state).fixed
     f4, i4 = np.float32, np.int32
     expected: Expected = {
         "anchors.positions": (f4, (count, 3)),
         "anchors.rows": (f4, (count, columns)),
         "anchors.ids": (i4, (count,)),
-        "adam.exp_avg": (f4, (count, columns)),
-        "adam.exp_avg_sq": (f4, (count, columns)),
+        "adam.exp_avg": (f4, (trained, columns)),
+        "adam.exp_avg_sq": (f4, (trained, columns)),
         "growth.gradient": (f4, (count * k,)),
         "growth.visits": (i4, (count * k,)),
         "growth.opacity": (f4, (count,)),
@@ -211,7 +210,7 @@ def _check_training(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> No
     shapes: Expected = {f"heads.{name}": (f4, tuple(value.shape)) for name, value in heads.state_dict().items()}
     if any(name.startswith("mean.") for name in tensors):
         shapes |= {f"mean.{name}": shape for name, shape in shapes.items()}
-        shapes |= {"mean.rows": (f4, (count, columns)), "mean.background": (f4, (3,))}
+        shapes |= {"mean.rows": (f4, (trained, columns)), "mean.background": (f4, (3,))}
     if "colors.steps" in tensors:
         photos = len(tensors["colors.steps"])
         shapes |= {name: (f4, (photos, 2, 3)) for name in ("colors.values", "colors.exp_avg", "colors.exp_avg_sq")}

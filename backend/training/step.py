@@ -152,6 +152,7 @@ class ViewStep:
         head_optimizer: HeadAdam,
         growth: GrowthStrategy,
         check: FiniteCheck,
+        fits_colors: bool = True,
     ) -> None:
         self.scene = scene
         self.settings = settings
@@ -163,6 +164,7 @@ class ViewStep:
         self.colors = (
             PhotoColors(len(scene.capture), scene.capture.train_indices, model.device) if settings.fit_colors else None
         )
+        self._fits_colors = fits_colors
         self._limits = _Limits()
         self._dropout: Dropout | None = None
         self._alone = False
@@ -265,7 +267,7 @@ class ViewStep:
             return None
         self._head_optimizer.zero_grad()
         rows = take_rows(anchors.rows, seen).requires_grad_()
-        correction = None if self.colors is None else self.colors.of(index)
+        correction = None if self.colors is None else self.colors.of(index).requires_grad_(self._fits_colors)
         losses, splats, statistics = [], [], []
         for part in self._parts_of(camera, image, labels):
             chosen = self._anchors_of(part, seen, rows)

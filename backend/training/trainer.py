@@ -25,12 +25,13 @@ from ..shared.reconstruction.objects import default_name
 from ..shared.stopping import StopRequest
 from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
+from .cells.region import Region
 from .check_finite import FiniteCheck
 from .growth_strategy import GrowthStrategy
 from .initial_model import DistantPoints, initial_model
-from .optimizer.adam import BETA1, BETA2, step_rows
 from .optimizer.average import Average
 from .optimizer.head_adam import HeadAdam
+from .optimizer.row_adam import RowAdam
 from .scene import Scene
 from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rates
 from .state import (
@@ -38,7 +39,6 @@ from .state import (
     read_checkpoint,
     require_settings,
     restore_statistics,
-    restore_tensor,
     training_state,
     training_tensors,
 )
@@ -57,25 +57,36 @@ Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
 class Trainer:
     """A model in training. Create one with `start` or `resume`, then call `run`."""
 
-    def __init__(self, scene: Scene, settings: Settings, model: ObjectModel, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings,
+        model: ObjectModel,
+        rng: np.random.Generator,
+        region: Region | None = None,
+    ) -> None:
         self.scene = scene
         self.settings = settings
         self.model = model
         self.rng = rng
         self.progress = TrainingProgress()
-        self._exp_avg = torch.zeros_like(model.anchors.rows)
-        self._exp_avg_sq = torch.zeros_like(model.anchors.rows)
+        self.region = region or Region()
+        self.row_optimizer = RowAdam(model.anchors.rows, self.region.fixed)
         self._warnings: list[str] = []
         # Not before the current checkpoint is known to be complete, and one of this training.
         self._keeps_current = False
-        self._average = Average(model)
-        model.background.requires_grad_(settings.background == "learned")
+        self._average = Average(model, self.region.fixed)
+        whole = self.region.is_whole
+        model.background.requires_grad_(settings.background == "learned" and whole)
+        model.heads.requires_grad_(whole)
         names = [name for name in HEAD_RATES if name != "background"]
         heads = {name: list(getattr(model.heads, name).parameters()) for name in names}
         self._head_optimizer = HeadAdam({**heads, "background": [model.background]})
         self._check = FiniteCheck(model.device)
-        self._growth = GrowthStrategy(settings, model)
-        self.view_step = ViewStep(scene, settings, model, self._head_optimizer, self._growth, self._check)
+        self._growth = GrowthStrategy(settings, model, self.region)
+        self.view_step = ViewStep(
+            scene, settings, model, self._head_optimizer, self._growth, self._check, fits_colors=whole
+        )
 
     @classmethod
     def start(
@@ -133,10 +144,12 @@ class Trainer:
         model = self.model
         self.progress.skipped += self._check.take_skipped()
         tensors = training_tensors(
-            model, self._exp_avg, self._exp_avg_sq, self._growth.statistics, self._average, self._head_optimizer,
+            model, self.row_optimizer, self._growth.statistics, self._average, self._head_optimizer,
             self.view_step.colors,
         )  # fmt: skip
-        state = training_state(self.settings, model, self.scene.supervise_background, self.rng, self.progress)
+        state = training_state(
+            self.settings, model, self.scene.supervise_background, self.rng, self.progress, self.region
+        )
         save_checkpoint(folder, tensors, state, keep_current=self._keeps_current)
         self._keeps_current = True
 
@@ -193,12 +206,12 @@ class Trainer:
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
-        trainer = cls(scene, settings, model.to(device), rng)
-        trainer._exp_avg = restore_tensor(tensors, "adam.exp_avg", device)
-        trainer._exp_avg_sq = restore_tensor(tensors, "adam.exp_avg_sq", device)
+        region = Region.of(state)
+        trainer = cls(scene, settings, model.to(device), rng, region)
+        trainer.row_optimizer.restore(tensors)
         trainer._growth.statistics = restore_statistics(tensors, device)
         trainer._head_optimizer.restore(tensors)
-        trainer._average = Average.from_checkpoint(tensors, trainer.model)
+        trainer._average = Average.from_checkpoint(tensors, trainer.model, region.fixed)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
         return trainer
@@ -386,23 +399,26 @@ class Trainer:
         kept = torch.ones(len(a), dtype=torch.bool, device=model.device)
         kept[fault.unrecoverable] = False
         a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
-        self._exp_avg, self._exp_avg_sq = self._exp_avg[kept], self._exp_avg_sq[kept]
+        kept = kept[self.region.fixed :]
+        self.row_optimizer.take(kept, 0)
         self._average.take(kept, a.rows[:0])
         self._growth.clear(model)
 
     def _update(self, gradients: ViewGradients, progress: float) -> None:
-        step, optimizer = self.progress.step, self._head_optimizer
+        optimizer = self._head_optimizer
         of_heads = {
             name: [parameter.grad for parameter in group if parameter.grad is not None]
             for name, group in optimizer.groups.items()
         }
-        updated = optimizer.step(
-            {name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, gradients.finite
-        )
+        skipped: int | torch.Tensor = 0
+        if self.region.is_whole:
+            skipped = ~optimizer.step(
+                {name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, gradients.finite
+            )
         assert gradients.rows.grad is not None
-        skipped = ~updated + step_rows(
-            self.model.anchors.rows, self._exp_avg, self._exp_avg_sq, gradients.seen, gradients.rows.grad,
-            row_rates(self.settings, progress), 1 - BETA1**step, 1 - BETA2**step, gradients.usable,
+        skipped = skipped + self.row_optimizer.step(
+            self.model.anchors.rows, gradients.seen, gradients.rows.grad, row_rates(self.settings, progress),
+            self.progress.step, gradients.usable,
         )  # fmt: skip
         self._check.skipped += skipped
         if self._check.at_once and skipped:
@@ -419,9 +435,7 @@ class Trainer:
             return
         p.last_growth = p.step
         growth = self._growth.grow(self.model, self.rng)
-
-        def follow(moments: torch.Tensor) -> torch.Tensor:
-            return torch.cat([moments[growth.kept], moments.new_zeros((growth.added, moments.shape[1]))])
-
-        self._exp_avg, self._exp_avg_sq = follow(self._exp_avg), follow(self._exp_avg_sq)
-        self._average.take(growth.kept, anchors.rows[len(anchors) - growth.added :])
+        # All fixed anchors are kept.
+        kept = growth.kept[self.region.fixed :] - self.region.fixed
+        self.row_optimizer.take(kept, growth.added)
+        self._average.take(kept, anchors.rows[len(anchors) - growth.added :])

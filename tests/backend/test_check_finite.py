@@ -108,7 +108,7 @@ def test_unrecoverable_splat_is_reported_and_removed(trainer, monkeypatch, value
     count = len(anchors)
     kept = torch.cat([anchors.positions[:near], anchors.positions[near + 1 :]])
     assert trained.step(0.6).isnan()
-    assert len(anchors) == len(trained._exp_avg) == count - 1 and torch.equal(anchors.positions, kept)
+    assert len(anchors) == len(trained.row_optimizer.exp_avg) == count - 1 and torch.equal(anchors.positions, kept)
     assert all(t.isfinite().all() for t in numbers(trained))
     what = "the volume loss" if math.isnan(value) else "the image loss"
     splat = 0 if math.isnan(value) else 2

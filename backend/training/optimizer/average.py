@@ -28,10 +28,17 @@ _PREFIX = "mean."
 
 
 class Average:
-    """Running mean of the models passed to `follow`; initially a copy of `model`."""
+    """Running mean of the models passed to `follow`; initially a copy of `model`.
 
-    def __init__(self, model: ObjectModel) -> None:
-        self._rows = model.anchors.rows.clone()
+    Args:
+        model: the model.
+        fixed: number of anchors, the first ones, that do not change and of which no mean is kept.
+        rows: (n, columns), the mean of the other anchors' rows, if it is known.
+    """
+
+    def __init__(self, model: ObjectModel, fixed: int = 0, rows: torch.Tensor | None = None) -> None:
+        self._fixed = fixed
+        self._rows = model.anchors.rows[fixed:].clone() if rows is None else rows
         self._heads = copy.deepcopy(model.heads).requires_grad_(False)
         self._background = model.background.detach().clone()
 
@@ -40,18 +47,24 @@ class Average:
         if step % EVERY:
             return
         weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
-        self._rows.lerp_(model.anchors.rows, weight)
+        self._rows.lerp_(model.anchors.rows[self._fixed :], weight)
         self._background.lerp_(model.background.detach(), weight)
         for mean, parameter in zip(self._heads.parameters(), model.heads.parameters(), strict=True):
             mean.lerp_(parameter.detach(), weight)
 
     def take(self, kept: torch.Tensor, new: torch.Tensor) -> None:
-        """Apply a change of the anchors: keep the rows `kept` (mask or indices), then append `new` (n, columns)."""
+        """Apply a change of the anchors.
+
+        Args:
+            kept: mask or indices of the rows that are kept, not counting those of fixed anchors.
+            new: (n, columns), rows that are appended.
+        """
         self._rows = torch.cat([self._rows[kept], new])
 
     def of(self, model: ObjectModel) -> ObjectModel:
         """Return the mean as a model; `model` is the model in training."""
-        anchors = replace(model.anchors, rows=self._rows)
+        fixed = model.anchors.rows[: self._fixed]
+        anchors = replace(model.anchors, rows=torch.cat([fixed, self._rows]) if self._fixed else self._rows)
         return replace(model, anchors=anchors, heads=self._heads, background=self._background)
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -61,16 +74,15 @@ class Average:
         return {_PREFIX + name: value for name, value in values.items()}
 
     @classmethod
-    def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel) -> Average:
-        """Restore the mean from a checkpoint's tensors, on the device of `model`.
+    def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel, fixed: int = 0) -> Average:
+        """Restore the mean from a checkpoint's tensors, on the device of `model`; `fixed` as for the class.
 
         For checkpoints of versions without a mean, it is initialized with `model`.
         """
-        average = cls(model)
         found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
         if not found:
-            return average
-        average._rows.copy_(torch.from_numpy(found.pop("rows").copy()))
+            return cls(model, fixed)
+        average = cls(model, fixed, torch.from_numpy(found.pop("rows")).to(model.device))
         average._background.copy_(torch.from_numpy(found.pop("background").copy()))
         heads = {name.removeprefix("heads."): torch.from_numpy(value.copy()) for name, value in found.items()}
         average._heads.load_state_dict(heads)

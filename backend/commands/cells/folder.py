@@ -1,0 +1,168 @@
+"""The folder cells/ of a reconstruction.
+
+cells.json               the division, see `backend.training.cells.division`
+coarse/                  the checkpoint that was divided
+0/, 1/, ...              one folder a cell: checkpoint/, and part.json, which tells how far its training is
+seams/                   the same of the seams between the joined cells
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ...capture import Capture
+from ...labels import correct_masks
+from ...raster import Camera, devices
+from ...shared.errors import InputError
+from ...shared.formats.json_file import read_json, write_json
+from ...shared.formats.points_ply import read_points
+from ...shared.formats.typed import typed
+from ...shared.reconstruction.checkpoint import CURRENT
+from ...shared.reconstruction.folder import Reconstruction
+from ...shared.stopping import StoppingReporter
+from ...training.cells.division import NO_CELL, Division, read_division
+from ...training.cells.parts import Checkpoint
+from ...training.scene import Scene
+from ...training.state import require_checkpoint
+from ..folder import Trained, open_trained
+
+CHECKPOINT = "checkpoint"
+"""Name of the folder of a part's checkpoints in that of the part."""
+
+_RECORD = "part.json"
+
+
+class CellFolders:
+    """Paths in the folder cells/."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.division = folder / "cells.json"
+        self.coarse = folder / "coarse"
+        self.seams = folder / "seams"
+
+    def cell(self, number: int) -> Path:
+        """Return the folder of a cell's checkpoint, counted from 0."""
+        return self.folder / str(number)
+
+
+@dataclass(frozen=True)
+class Divided:
+    """An opened reconstruction that is divided into cells.
+
+    Attributes:
+        trained: the reconstruction with its coarse model.
+        capture: its capture with corrected masks, as for the training of the coarse model.
+        folders: the folders of the cells.
+        division: the cells.
+        coarse: checkpoint of the coarse model.
+        cell_of: (N,) the cell of each of its anchors.
+    """
+
+    trained: Trained
+    capture: Capture
+    folders: CellFolders
+    division: Division
+    coarse: Checkpoint
+    cell_of: np.ndarray
+
+    def cameras(self, names: Collection[str]) -> list[Camera]:
+        """Return the cameras of the named views, in scene units."""
+        wanted = set(names)
+        return [self.trained.scene.camera(i) for i, view in enumerate(self.capture.views) if view.name in wanted]
+
+    def restricted(self, names: Collection[str]) -> Capture:
+        """Return the capture with only the named views to train on."""
+        wanted = set(names)
+        return self.capture.excluding_from_training({v.name for v in self.capture.views if v.name not in wanted})
+
+
+def open_divided(options: argparse.Namespace, reporter: StoppingReporter) -> Divided:
+    """Open a reconstruction that `split` has divided.
+
+    Args:
+        options: as for `open_trained`.
+        reporter: receives status and warnings.
+
+    Raises:
+        InputError: as `open_trained`, or it is not divided.
+    """
+    folders = CellFolders(Reconstruction(options.folder).cells)
+    division = read_division(folders.division)
+    trained = open_trained(options, reporter, folders.coarse)
+    coarse = read_part(folders.coarse)
+    if digest_of(folders.coarse) != division.checkpoint:
+        raise InputError(f"{folders.division} belongs to another model than {folders.coarse}; run `split` again.")
+    return Divided(
+        trained, with_corrected_masks(trained), folders, division, coarse,
+        cells_of(division, trained.scene, coarse[0]["anchors.positions"]),
+    )  # fmt: skip
+
+
+def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndarray:
+    """Return the cell of each of the positions (N, 3) in scene units, which for distant surroundings is none."""
+    near = devices.host(scene.before_surroundings(torch.from_numpy(positions)))
+    return np.where(near, division.cells_of(positions), NO_CELL)
+
+
+def with_corrected_masks(trained: Trained) -> Capture:
+    """Return the capture of a training with its masks corrected, as the training itself does."""
+    if not trained.capture.has_masks:
+        return trained.capture
+    ids = read_points(trained.folder.points).ids
+    return correct_masks(trained.capture, ids, ignore_gaps=trained.scene.supervise_background)[0]
+
+
+def read_part(folder: Path) -> Checkpoint:
+    """Return the checkpoint in a folder of cells/; raise InputError if there is none or it is damaged."""
+    tensors, state, _ = require_checkpoint(folder)
+    return tensors, state
+
+
+def digest_of(folder: Path) -> str:
+    """Return a hash of the checkpoint in a folder of cells/."""
+    with (folder / CURRENT).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class PartRecord:
+    """part.json: what a part was made of, and how far it is.
+
+    made_of: hashes of the checkpoints that its training began with. complete: whether that is complete, of `steps`
+    that took `seconds`, with so many `anchors` in the core of the cell.
+    """
+
+    made_of: tuple[str, ...]
+    complete: bool = False
+    steps: int = 0
+    seconds: float = 0.0
+    anchors: int = 0
+
+
+def write_part_record(folder: Path, record: PartRecord) -> None:
+    """Write part.json of a folder of cells/."""
+    write_json(folder / _RECORD, {**asdict(record), "made_of": list(record.made_of)})
+
+
+def read_part_record(folder: Path) -> PartRecord | None:
+    """Read part.json of a folder of cells/; None if there is none.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    path = folder / _RECORD
+    if not path.exists():
+        return None
+    try:
+        found = typed(PartRecord, read_json(path))
+        return PartRecord(**{**found, "made_of": tuple(found["made_of"])})
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path} is damaged; train this part again with --restart.") from error

@@ -1,0 +1,63 @@
+"""`split`: divide a trained reconstruction into cells that are trained one by one, in any order and on any machine."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+
+import numpy as np
+
+from ...shared.errors import InputError
+from ...shared.formats.atomic import atomic_path, make_folder
+from ...shared.reconstruction.checkpoint import CURRENT
+from ...shared.reconstruction.lock import locked
+from ...shared.stopping import StoppingReporter
+from ...training.cells.division import Division, divide, write_division
+from ...training.cells.visibility import first_unseen, shares, with_views
+from ..folder import READ, open_trained
+from ..stages import stage
+from .folder import CellFolders, cells_of, digest_of
+
+_VIEWS = "views"
+
+
+def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Write cells/ with the division and a copy of the checkpoint."""
+    reporter.expect({READ: ("Preparing", 5.0), _VIEWS: ("Choosing views", 20.0)})
+    trained = open_trained(options, reporter)
+    folders = CellFolders(trained.folder.cells)
+    scene, model, views = trained.scene, trained.model, trained.capture.views
+    with locked(trained.folder.folder), stage(trained.folder, "split"):
+        if folders.folder.exists() and not options.restart:
+            raise InputError(f"{trained.folder.folder} is already divided; use --restart to discard its cells.")
+        positions = model.anchors.positions.cpu().numpy()
+        near = scene.before_surroundings(model.anchors.positions).cpu().numpy()
+        if near.sum() < options.cells:
+            raise InputError(
+                f"The model has {near.sum()} anchors, too few for {options.cells} cells; use fewer --cells."
+            )
+        cells = tuple(divide(positions[near].astype(np.float64), options.cells, options.overlap))
+        division = Division("", options.overlap, cells)
+        reporter.begin(_VIEWS, f"Choosing the views of {options.cells} cells")
+        training = trained.capture.train_indices
+        found = []
+        measured = shares(model, division, cells_of(division, scene, positions), map(scene.camera, training))
+        for done, of_view in enumerate(measured, 1):
+            found.append(of_view)
+            reporter.progress(done, len(training), what="views")
+        division = with_views(division, [views[index].name for index in training], np.array(found))
+        unseen = first_unseen(division.cells)
+        if unseen is not None:
+            raise InputError(f"No view shows cell {unseen}; use fewer --cells.")
+        if folders.folder.exists():
+            shutil.rmtree(folders.folder)
+        make_folder(folders.coarse)
+        with atomic_path(folders.coarse / CURRENT) as part:
+            shutil.copyfile(trained.folder.checkpoint / CURRENT, part)
+        # Last, since it makes the folder one of cells.
+        write_division(
+            folders.division, Division(digest_of(folders.coarse), options.overlap, division.cells, division.seam_views)
+        )
+    for number, cell in enumerate(division.cells):
+        reporter.status(f"Cell {number}: {cell.anchors:,} anchors, {len(cell.views)} views")
+    reporter.done(cells=len(division.cells), folder=str(folders.folder), seam_views=len(division.seam_views))

@@ -1,0 +1,88 @@
+"""`train-cell`: train one cell of a divided reconstruction, or go on where that was stopped."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from dataclasses import replace
+
+from ...model.checkpoint import has_checkpoint
+from ...shared.errors import InputError
+from ...shared.formats.atomic import make_folder, remove_abandoned
+from ...shared.reconstruction.lock import locked
+from ...shared.stopping import StoppingReporter
+from ...training.budget import Budget
+from ...training.cells.parts import begin_cell
+from ...training.cells.region import inside
+from ...training.trainer import Trainer
+from ..folder import READ, memory_for_targets
+from ..setup.kernels import PART as KERNELS
+from ..setup.kernels import ensure_kernels, kernel_seconds
+from .folder import CHECKPOINT, Divided, PartRecord, open_divided, write_part_record
+
+FIRST = 0.1
+"""Progress at the first step: the coarse model is there, and anchors begin to grow."""
+
+_TRAIN = "train"
+
+
+def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
+    """Train a cell in its own folder; nothing else is written, so that others may train other cells."""
+    seconds = None if options.minutes is None else 60 * options.minutes
+    reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _TRAIN: ("Training", seconds or 300.0)})
+    divided = open_divided(options, reporter)
+    division, device = divided.division, divided.trained.model.device
+    number = options.cell
+    if number >= len(division.cells):
+        raise InputError(f"There is no cell {number}: {divided.folders.division} has {len(division.cells)}, from 0 on.")
+    steps = options.steps or (None if seconds else max(divided.trained.progress.step, 1))
+    budget = Budget(steps, seconds, first=FIRST)
+    folder = divided.folders.cell(number)
+    make_folder(folder)
+    with locked(folder):
+        remove_abandoned(folder)
+        if options.restart:
+            shutil.rmtree(folder / CHECKPOINT, ignore_errors=True)
+        trainer = _open(divided, number, options, reporter)
+        record = PartRecord((division.checkpoint,))
+        if budget.progress(trainer.progress) >= 1:
+            reporter.status(
+                f"Cell {number} is already trained for {trainer.progress.step} steps; specify more --minutes or "
+                "--steps to extend it, or --restart to start over."
+            )
+        else:
+            write_part_record(folder, record)
+            reporter.expect({KERNELS: ("Preparing", kernel_seconds(device))})
+            ensure_kernels(reporter, device)
+            reporter.begin(_TRAIN, f"Training {_trained(trainer):,} anchors of cell {number}")
+            trainer.run(
+                budget, folder / CHECKPOINT, reporter.reporter, stop=reporter.stop,
+                checkpoint_seconds=options.checkpoint_seconds,
+            )  # fmt: skip
+        fixed, positions, p = trainer.region.fixed, trainer.model.anchors.positions.cpu().numpy(), trainer.progress
+        kept = int(inside(positions[fixed:], division.cells[number].core).sum())
+        write_part_record(
+            folder, replace(record, complete=True, steps=p.step, seconds=round(p.seconds, 2), anchors=kept)
+        )
+    reporter.done(steps=trainer.progress.step, seconds=round(trainer.progress.seconds, 1), anchors=_trained(trainer))
+
+
+def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: StoppingReporter) -> Trainer:
+    """Return the trainer of a cell, resumed if it was begun before."""
+    cell, scene = divided.division.cells[number], divided.trained.scene
+    capture, checkpoint = divided.restricted(cell.views), divided.folders.cell(number) / CHECKPOINT
+    memory, device = memory_for_targets(options), divided.trained.model.device
+    if has_checkpoint(checkpoint):
+        resumed = Trainer.resume(capture, checkpoint, None, memory, device, scene.gains)
+        assert resumed is not None
+        trainer, warning = resumed
+        if warning:
+            reporter.warning(warning)
+        return trainer
+    tensors, state = begin_cell(divided.coarse, divided.division, number, divided.cell_of, divided.cameras(cell.views))
+    return Trainer.restore(capture, tensors, state, memory, device, scene.gains)
+
+
+def _trained(trainer: Trainer) -> int:
+    """Return the number of anchors that are trained."""
+    return len(trainer.model.anchors) - trainer.region.fixed

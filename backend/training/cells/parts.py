@@ -1,0 +1,191 @@
+"""Checkpoints of the parts of a model: of a cell, of the seams, and of all cells merged.
+
+A part begins with the anchors around it that its views show, which stay fixed. All parts share heads, background, voxel
+size and table of objects, so that their anchors can be put together again without loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from ...model.anchors import Anchors
+from ...model.object_model import anchors_in_view
+from ...raster import Camera
+from ..budget import TrainingProgress
+from ..settings import Settings
+from ..step import frustum
+from .division import NO_CELL, Division
+from .region import Bounds, Region, inside
+
+Checkpoint = tuple[dict[str, np.ndarray], dict[str, Any]]
+"""Tensors and state of a checkpoint, as `read_checkpoint` returns them."""
+
+NOWHERE: Bounds = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+"""Bounds in which no anchors are added."""
+
+_OF_ANCHORS = ("positions", "rows", "ids")
+
+
+def anchors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
+    """Return the anchors of a checkpoint, with the mean of their rows where there is one: positions, rows and ids."""
+    tensors, state = checkpoint
+    found = {name: tensors[f"anchors.{name}"] for name in _OF_ANCHORS}
+    if "mean.rows" in tensors:
+        fixed = Region.of(state).fixed
+        found["rows"] = np.concatenate([found["rows"][:fixed], tensors["mean.rows"]]) if fixed else tensors["mean.rows"]
+    return found
+
+
+def begin_part(
+    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, cameras: Iterable[Camera],
+    seed: Sequence[int],
+) -> Checkpoint:  # fmt: skip
+    """Return the checkpoint from which a part of a model is trained.
+
+    Args:
+        shared: checkpoint of the coarse model.
+        anchors: anchors of the whole model, as from `anchors_of`.
+        trained: (N,) bool, those of the part.
+        bounds: where anchors may be added.
+        cameras: the views of the part, in scene units; other anchors that none of them shows are left out.
+        seed: of the random numbers.
+    """
+    tensors, state = shared
+    settings = Settings(**state["settings"])
+    of_anchors = (torch.from_numpy(np.ascontiguousarray(anchors[name])) for name in _OF_ANCHORS)
+    every = Anchors(settings.layout, float(state["voxel"]), *of_anchors)
+    seen = np.zeros(len(every), np.bool_)
+    for camera in cameras:
+        seen[anchors_in_view(every, *frustum(camera)).numpy()] = True
+    order = np.concatenate([np.flatnonzero(seen & ~trained), np.flatnonzero(trained)])
+    fixed = len(order) - int(trained.sum())
+    made = _untrained(tensors, {name: anchors[name][order] for name in _OF_ANCHORS}, fixed, settings)
+    rng = np.random.default_rng([settings.seed, *seed])
+    return made, {
+        **state, "rng": rng.bit_generator.state, "progress": {**TrainingProgress().__dict__},
+        "region": Region(fixed, bounds).as_dict(),
+    }  # fmt: skip
+
+
+def begin_cell(
+    shared: Checkpoint, division: Division, number: int, cell_of: np.ndarray, cameras: Iterable[Camera]
+) -> Checkpoint:
+    """Return the checkpoint from which a cell is trained.
+
+    Args:
+        shared: checkpoint of the coarse model.
+        division, number: the cells, and which of them.
+        cell_of: (N,) the cell of each anchor of the coarse model.
+        cameras: the cell's training views, in scene units.
+    """
+    anchors, bounds = anchors_of(shared), division.cells[number].bounds
+    trained = inside(anchors["positions"], bounds) & (cell_of != NO_CELL)
+    return begin_part(shared, anchors, trained, bounds, cameras, (number,))
+
+
+def join_cells(
+    shared: Checkpoint, division: Division, cell_of: np.ndarray, cells: Iterable[Checkpoint], counts: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Return the anchors of the coarse model that belong to no cell, followed by those in the cores of trained cells.
+
+    Args:
+        shared: checkpoint of the coarse model.
+        division: the cells.
+        cell_of: (N,) the cell of each anchor of the coarse model.
+        cells: checkpoint of each cell, read one after another.
+        counts: number of anchors in the core of each cell.
+
+    Returns:
+        Positions, rows and IDs, as from `anchors_of`.
+    """
+    of_none = {name: values[cell_of == NO_CELL] for name, values in anchors_of(shared).items()}
+    end = len(of_none["ids"])
+    joined = {name: np.empty((end + sum(counts), *values.shape[1:]), values.dtype) for name, values in of_none.items()}
+    for name, values in of_none.items():
+        joined[name][:end] = values
+    for cell, checkpoint in zip(division.cells, cells, strict=True):
+        fixed, anchors = Region.of(checkpoint[1]).fixed, anchors_of(checkpoint)
+        here = fixed + np.flatnonzero(inside(anchors["positions"][fixed:], cell.core))
+        for name, values in anchors.items():
+            joined[name][end : end + len(here)] = values[here]
+        end += len(here)
+    return joined
+
+
+def begin_seams(
+    shared: Checkpoint, division: Division, anchors: dict[str, np.ndarray], surroundings: int, cameras: Iterable[Camera]
+) -> Checkpoint:
+    """Return the checkpoint from which the seams of joined cells are trained; no anchors are added.
+
+    Args:
+        shared: checkpoint of the coarse model.
+        division: the cells.
+        anchors: the joined anchors, from `join_cells`.
+        surroundings: number of the first of them that belong to no cell.
+        cameras: the training views that show seams, in scene units.
+    """
+    return begin_part(
+        shared, anchors, _on_seams(division, anchors, surroundings), NOWHERE, cameras, (len(division.cells),)
+    )
+
+
+def merged(
+    shared: Checkpoint,
+    division: Division,
+    anchors: dict[str, np.ndarray],
+    surroundings: int,
+    seams: Checkpoint,
+    progress: TrainingProgress,
+) -> Checkpoint:
+    """Return the checkpoint of the whole model, after the training of the seams.
+
+    Args:
+        shared, division, anchors, surroundings: as for `begin_seams`.
+        seams: checkpoint of the trained seams.
+        progress: of the whole training.
+
+    The joined anchors are changed in place.
+    """
+    tensors, state = shared
+    fixed, trained = Region.of(seams[1]).fixed, anchors_of(seams)
+    of_seams = _on_seams(division, anchors, surroundings)
+    if int(of_seams.sum()) == len(trained["ids"]) - fixed:
+        anchors["rows"][of_seams] = trained["rows"][fixed:]
+    else:
+        # Anchors whose parameters were not finite have been removed.
+        anchors = {name: np.concatenate([anchors[name][~of_seams], trained[name][fixed:]]) for name in _OF_ANCHORS}
+    made = _untrained(tensors, anchors, 0, Settings(**state["settings"]))
+    return made, {**state, "progress": {**progress.__dict__}}
+
+
+def _untrained(
+    shared: dict[str, np.ndarray], anchors: dict[str, np.ndarray], fixed: int, settings: Settings
+) -> dict[str, np.ndarray]:
+    """Return the tensors of a checkpoint with these anchors, of which no training has begun.
+
+    The heads are the mean ones of `shared`, the tensors of the coarse model.
+    """
+    count, k, columns = len(anchors["ids"]), settings.offsets, settings.layout.columns
+    made = {f"anchors.{name}": values for name, values in anchors.items()}
+    # Zeros take no memory before they are written to.
+    made |= {f"adam.{name}": np.zeros((count - fixed, columns), np.float32) for name in ("exp_avg", "exp_avg_sq")}
+    made |= {
+        "growth.gradient": np.zeros(count * k, np.float32), "growth.visits": np.zeros(count * k, np.int32),
+        "growth.opacity": np.zeros(count, np.float32), "growth.views": np.zeros(count, np.int32),
+    }  # fmt: skip
+    made |= {name: value for name, value in shared.items() if name.startswith(("heads.", "colors."))}
+    made |= {name.removeprefix("mean."): value for name, value in shared.items() if name.startswith("mean.heads.")}
+    return {
+        **made, "object_ids": shared["object_ids"],
+        "background": shared.get("mean.background", shared["background"]),
+    }  # fmt: skip
+
+
+def _on_seams(division: Division, anchors: dict[str, np.ndarray], surroundings: int) -> np.ndarray:
+    found = division.on_seams(anchors["positions"])
+    found[:surroundings] = False
+    return found

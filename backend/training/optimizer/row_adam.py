@@ -1,0 +1,81 @@
+"""Adam for the rows of the anchors, with the moments of all that are trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from .adam import BETA1, BETA2, step_rows
+
+_PREFIX = "adam."
+
+
+class RowAdam:
+    """The moments of a model's rows.
+
+    Args:
+        rows: (N, columns) float32.
+        fixed: number of rows, the first ones, that are not trained and have no moments.
+
+    Attributes:
+        exp_avg, exp_avg_sq: (N - fixed, columns) float32.
+    """
+
+    def __init__(self, rows: torch.Tensor, fixed: int) -> None:
+        self._fixed = fixed
+        self.exp_avg = torch.zeros_like(rows[fixed:])
+        self.exp_avg_sq = torch.zeros_like(self.exp_avg)
+
+    def step(
+        self,
+        rows: torch.Tensor,
+        seen: torch.Tensor,
+        gradients: torch.Tensor,
+        rates: np.ndarray,
+        number: int,
+        usable: torch.Tensor | None,
+    ) -> torch.Tensor:
+        """Perform one step in place, except on fixed rows.
+
+        Args:
+            rows: (N, columns), the rows.
+            seen: (n,) int64, indices of the rows with gradients, on the CPU ascending.
+            gradients: (n, columns).
+            rates: (columns,) float32, the learning rates.
+            number: of the step, from 1 on.
+            usable: as for `step_rows`, whose result is returned.
+        """
+        fixed = self._fixed
+        if fixed and usable is not None:
+            # Selecting rows would synchronize with the GPU; row 0 stands for fixed ones, which are not changed.
+            seen, usable = (seen - fixed).clamp_(min=0), usable & (seen >= fixed)
+        elif fixed:
+            first = int(torch.searchsorted(seen, fixed))
+            seen, gradients = seen[first:] - fixed, gradients[first:]
+        return step_rows(
+            rows[fixed:], self.exp_avg, self.exp_avg_sq, seen, gradients, rates, 1 - BETA1**number, 1 - BETA2**number,
+            usable,
+        )  # fmt: skip
+
+    def take(self, kept: torch.Tensor, added: int) -> None:
+        """Apply a change of the anchors.
+
+        Args:
+            kept: mask or indices of the rows that are kept, not counting fixed ones.
+            added: number of rows that are appended.
+        """
+        for name in ("exp_avg", "exp_avg_sq"):
+            moments = getattr(self, name)[kept]
+            setattr(self, name, torch.cat([moments, moments.new_zeros((added, moments.shape[1]))]))
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the moments as tensors for a checkpoint."""
+        return {f"{_PREFIX}exp_avg": self.exp_avg, f"{_PREFIX}exp_avg_sq": self.exp_avg_sq}
+
+    def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
+        """Take the moments of a checkpoint's tensors; on the CPU, they share their memory."""
+        device = self.exp_avg.device
+        self.exp_avg = torch.from_numpy(tensors[f"{_PREFIX}exp_avg"]).to(device)
+        self.exp_avg_sq = torch.from_numpy(tensors[f"{_PREFIX}exp_avg_sq"]).to(device)
