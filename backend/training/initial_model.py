@@ -73,7 +73,7 @@ def initial_model(
         more: xyz (n, 3), rgb (n, 3) uint8 and IDs (n,) of further points.
         surroundings: points of distant surroundings, which belong to no object.
         most_anchors: largest number of anchors without those of the surroundings, for which points are left out; None:
-            no limit.
+            that of the settings.
     """
     xyz, rgb, ids = capture.points.xyz[seeds], capture.points.rgb[seeds], point_ids[seeds]
     camera_centers = np.array([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in capture.views])
@@ -83,8 +83,9 @@ def initial_model(
         xyz, rgb, ids = (np.concatenate(pair) for pair in zip((xyz, rgb, ids), more, strict=True))
     finest = min(median_spacing(normalization.to_scene(xyz)), FINEST * pixel_size(capture) * normalization.scale)
     voxel = settings.voxel * normalization.scale if settings.voxel else finest
-    if most_anchors is not None:
-        kept = _thinned(normalization.to_scene(xyz), ids, voxel, most_anchors)
+    most = settings.max_anchors if most_anchors is None else min(most_anchors, settings.max_anchors)
+    if most_anchors is not None or _occupied(normalization.to_scene(xyz), voxel) > most:
+        kept = _thinned(normalization.to_scene(xyz), ids, voxel, most)
         xyz, rgb, ids = xyz[kept], rgb[kept], ids[kept]
     anchors = seed_anchors(
         normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
@@ -100,6 +101,11 @@ def initial_model(
     shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
     background = torch.from_numpy(shade[settings.background].astype(np.float32))
     return ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
+
+
+def _occupied(xyz: np.ndarray, voxel: float) -> int:
+    """Return the number of voxels with points xyz (M, 3)."""
+    return len(np.unique(cell_keys(xyz, voxel), axis=0))
 
 
 def _thinned(xyz: np.ndarray, ids: np.ndarray, voxel: float, most: int) -> np.ndarray:

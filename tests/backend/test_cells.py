@@ -205,7 +205,9 @@ def test_cells_are_trained_and_merged_by_commands(divided, run_command):
     before = load_checkpoint(divided / "checkpoint")
     assert_rejected(run_command("merge", divided), "Cell 0", "train-cell")
     assert_rejected(run_command("train-cell", divided, "--cell", 2), "no cell 2")
-    assert_rejected(run_command("split", divided, "--cells", 3), "--restart")
+    assert_rejected(run_command("split", divided, "--cells", 3), "2 cells", "--restart")
+    again = run_command("split", divided, "--cells", 2)
+    assert again.code == EXIT_DONE and "already divided" in again.out
     for number in range(2):
         result = run_command("train-cell", divided, "--cell", number, "--steps", 30, "--json")
         assert result.code == EXIT_DONE and result.events[-1]["steps"] == 30

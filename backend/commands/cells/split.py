@@ -12,7 +12,7 @@ from ...shared.formats.atomic import atomic_path, make_folder
 from ...shared.reconstruction.checkpoint import CURRENT
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
-from ...training.cells.division import Division, divide, write_division
+from ...training.cells.division import Division, divide, read_division, write_division
 from ...training.cells.visibility import first_unseen, shares, with_views
 from ..folder import READ, open_trained
 from ..stages import stage
@@ -28,8 +28,11 @@ def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     folders = CellFolders(trained.folder.cells)
     scene, model, views = trained.scene, trained.model, trained.capture.views
     with locked(trained.folder.folder), stage(trained.folder, "split"):
-        if folders.folder.exists() and not options.restart:
-            raise InputError(f"{trained.folder.folder} is already divided; use --restart to discard its cells.")
+        if folders.division.exists() and not options.restart:
+            _require_same(read_division(folders.division), options)
+            reporter.status("The model is already divided like that; use --restart to discard its cells.")
+            reporter.done(cells=options.cells, folder=str(folders.folder))
+            return
         positions = model.anchors.positions.cpu().numpy()
         near = scene.before_surroundings(model.anchors.positions).cpu().numpy()
         if near.sum() < options.cells:
@@ -61,3 +64,13 @@ def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     for number, cell in enumerate(division.cells):
         reporter.status(f"Cell {number}: {cell.anchors:,} anchors, {len(cell.views)} views")
     reporter.done(cells=len(division.cells), folder=str(folders.folder), seam_views=len(division.seam_views))
+
+
+def _require_same(division: Division, options: argparse.Namespace) -> None:
+    """Raise InputError if a model was divided otherwise before."""
+    cells, overlap = len(division.cells), division.overlap
+    if (cells, overlap) != (options.cells, options.overlap):
+        raise InputError(
+            f"{options.folder} is already divided into {cells} cells with an overlap of {overlap:g}; use --restart to "
+            "discard them."
+        )
