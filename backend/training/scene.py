@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -19,6 +21,15 @@ from .extent import SURROUNDINGS, Extent, extent_of
 
 if TYPE_CHECKING:
     from ..capture import Capture
+
+_Key = tuple[int, int]
+"""A view's index, and the factor by which its image is downscaled."""
+
+_Stored = tuple[torch.Tensor, torch.Tensor | None]
+"""Image and labels of a view."""
+
+_READ_AHEAD_ON_GPU = 4
+"""Number of views that are read, each by a thread, while a GPU trains with others; while the CPU trains, it is one."""
 
 _GPU_FRACTION = 0.25
 """Largest fraction of the GPU's free memory for cached targets."""
@@ -67,9 +78,12 @@ class Scene:
         self._budget = memory_mb * 1e6
         if device.type == "cuda":
             self._budget = min(self._budget, _GPU_FRACTION * torch.cuda.mem_get_info(device)[0])
-        self._held: OrderedDict[tuple[int, int], tuple[torch.Tensor, torch.Tensor | None]] = OrderedDict()
+        self._held: OrderedDict[_Key, _Stored] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
+        self._coming: dict[_Key, Future[_Stored]] = {}
+        self.read_ahead = 1 if device.type == "cpu" else _READ_AHEAD_ON_GPU
+        self._readers = ThreadPoolExecutor(self.read_ahead, "read-ahead")
 
     def camera(self, index: int, downscale: int = 1) -> Camera:
         """Return the camera of `capture.image(index, downscale)` in scene units."""
@@ -116,16 +130,33 @@ class Scene:
         )
         return image, wanted
 
-    def _stored(self, index: int, downscale: int) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Return a view's image (3, H, W) uint8 and labels in few bytes, a quarter of the size of a target."""
+    def expect(self, keys: Sequence[_Key]) -> None:
+        """Begin to read the targets that will be asked for next, of which there should be `read_ahead`.
+
+        What fails is raised when the target is asked for. Others that were expected before are no longer.
+        """
+        with self._lock:
+            for key in [key for key in self._coming if key not in keys]:
+                self._coming.pop(key).cancel()
+            for key in keys:
+                if key not in self._held and key not in self._coming:
+                    self._coming[key] = self._readers.submit(self._read, *key)
+
+    def _read(self, index: int, downscale: int) -> _Stored:
+        """Read a view's image (3, H, W) uint8 and labels in few bytes, a quarter of the size of a target."""
+        image = self._send(self.capture.image(index, downscale).transpose(2, 0, 1))
+        mask = self.capture.mask(index, downscale)
+        return image, None if mask is None else self._send(self._labels(mask))
+
+    def _stored(self, index: int, downscale: int) -> _Stored:
+        """Return the result of `_read`, which is kept within the memory limit."""
         key = (index, downscale)
         with self._lock:
             if key in self._held:
                 self._held.move_to_end(key)
                 return self._held[key]
-        image = self._send(self.capture.image(index, downscale).transpose(2, 0, 1))
-        mask = self.capture.mask(index, downscale)
-        labels = None if mask is None else self._send(self._labels(mask))
+            coming = self._coming.pop(key, None)
+        image, labels = self._read(*key) if coming is None else coming.result()
         with self._lock:
             if key not in self._held:
                 self._held[key] = (image, labels)

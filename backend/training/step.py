@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -187,6 +187,14 @@ class ViewStep:
         if self.colors is not None:
             self.colors.restore(tensors)
 
+    def expect(self, indices: Sequence[int], progress: float) -> None:
+        """Begin to read the photos of the views that follow, as many as the scene reads ahead."""
+        self.scene.expect([(index, self._downscale(index, progress)) for index in indices[: self.scene.read_ahead]])
+
+    def _downscale(self, index: int, progress: float) -> int:
+        view = self.scene.capture.views[index]
+        return downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
+
     def measure_seconds(self, index: int) -> float:
         """Measure how long the gradients of a view take at the start of the training; nothing is changed.
 
@@ -252,8 +260,7 @@ class ViewStep:
     def _compute(self, index: int, progress: float) -> ViewGradients | None:
         """Compute the loss and gradients of a view in the current number of parts."""
         anchors, on_gpu = self.model.anchors, devices.on_gpu(self.model.anchors.rows)
-        view = self.scene.capture.views[index]
-        downscale = downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
+        downscale = self._downscale(index, progress)
         image, labels = self.scene.target(index, downscale)
         camera = self.scene.camera(index, downscale)
         present = in_view = None

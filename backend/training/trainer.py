@@ -361,6 +361,7 @@ class Trainer:
         if not p.queue:
             views = [index for index in self.scene.capture.train_indices if index not in p.watched]
             p.queue = self.rng.permutation(views).tolist()
+        self.view_step.expect(p.queue[-2::-1], progress)
         gradients = self.view_step.compute(
             p.queue[-1], progress, overfitting.dropout_at(p, progress), alone=p.step % ALONE_EVERY == 0
         )

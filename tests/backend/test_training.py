@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from backend.commands.training.memory import warn_of_memory
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
 from backend.model.draw import draw
@@ -746,3 +747,56 @@ def test_paper_mode_has_no_residuals(tiny, tmp_path):
     trainer.save(tmp_path / "checkpoint")
     again, _ = Trainer.resume(capture, tmp_path / "checkpoint")
     assert again.settings.mode == "paper" and torch.equal(again.model.anchors.rows, trainer.model.anchors.rows)
+
+
+def test_training_that_may_take_more_memory_than_is_free_says_what_fits(tiny, monkeypatch):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, Settings(offsets=4, max_anchors=3_000_000))
+    warnings = []
+    reporter = SimpleNamespace(warning=warnings.append)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1 << 44))
+    warn_of_memory(trainer, 2000, reporter)
+    assert not warnings
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8e9))
+    warn_of_memory(trainer, 2000, reporter)
+    (sentence,) = warnings
+    fits = int(sentence.split("--max-anchors ")[1].split()[0])
+    assert "3,000,000 anchors" in sentence and 0 < fits < 3_000_000
+    roomy = Trainer.start(capture, ids, Settings(offsets=4, max_anchors=fits))
+    warn_of_memory(roomy, 2000, reporter)
+    assert len(warnings) == 1, "what is said to fit does"
+
+
+def test_training_begins_with_no_more_anchors_than_allowed(tiny):
+    capture, ids = tiny()
+    every, some = (Trainer.start(capture, ids, Settings(offsets=4, max_anchors=most)) for most in (10_000, 100))
+    assert len(every.model.anchors) > 150 and 40 < len(some.model.anchors) <= 100
+    assert set(some.model.anchors.ids.tolist()) == set(every.model.anchors.ids.tolist()), "each object keeps some"
+
+
+def test_next_photos_are_read_ahead_and_their_errors_raised_when_asked_for(tiny, monkeypatch):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, Settings(offsets=4))
+    scene, read = trainer.scene, []
+
+    def recording(index, downscale=1):
+        read.append(index)
+        if index == 5:
+            raise InputError("no photo 5")
+        return type(capture).image(capture, index, downscale)
+
+    monkeypatch.setattr(capture, "image", recording)
+    scene.expect([(2, 1)])
+    scene.expect([(2, 1), (5, 1)])
+    expected = scene.target(2)
+    assert read.count(2) == 1, "it is not read twice"
+    assert torch.equal(scene.target(2)[0], expected[0]) and read.count(2) == 1
+    with pytest.raises(InputError, match="no photo 5"):
+        scene.target(5)
+    scene.expect([])
+    assert scene.target(3)[0].shape == expected[0].shape and read.count(3) == 1
+    del read[:]
+    trainer.progress.queue = [1, 4, 6]
+    trainer.step(0.8)
+    scene.target(4)
+    assert sorted(read) == [4, 6], "the view after the present one was on its way"

@@ -47,6 +47,7 @@ from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
 from ..votes import VOTE, cast_votes, votes_are_current, votes_key
 from .measuring import Measuring
+from .memory import warn_of_memory
 from .points import DENSE, starting_points
 
 PACE = "pace"
@@ -100,6 +101,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _expect_training(budget, trainer.scene.capture, device, progress, reporter)
             if expected := expected_of(budget, trainer.scene.capture, device, progress, agreement):
                 reporter.status(expected)
+            warn_of_memory(trainer, options.memory_mb, reporter)
             try:
                 _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
             except Cancelled:

@@ -1,0 +1,59 @@
+"""The memory that a training takes, computed before it begins."""
+
+from __future__ import annotations
+
+import psutil
+
+from ...model.anchors import Layout
+from ...model.object_model import anchors_in_view
+from ...shared.events import Reporter
+from ...training.step import frustum
+from ...training.trainer import Trainer
+
+_BASE = 0.7e9
+"""Bytes of a training without a model: packages, kernels, and one view at a time."""
+
+_COPIES = 5
+"""Arrays with the size of the anchors' rows: the rows, two moments, their mean, and one that growth replaces."""
+
+_COPIES_IN_VIEW = 3
+"""The same for the anchors in one view: their rows, the gradient, and what is generated of them."""
+
+_VIEWS = 20
+"""Number of views in which anchors are counted."""
+
+_ROUNDING = 10_000
+
+
+def bytes_per_anchor(layout: Layout, in_view: float) -> float:
+    """Return the bytes that an anchor takes in a training on the CPU.
+
+    Args:
+        layout: columns of the anchors' rows.
+        in_view: the largest fraction of the anchors in one view.
+    """
+    return 4 * layout.columns * (_COPIES + _COPIES_IN_VIEW * in_view) + 8 * layout.offsets + 24
+
+
+def warn_of_memory(trainer: Trainer, memory_mb: float, reporter: Reporter) -> None:
+    """Warn if a training on the CPU may take more memory than is free.
+
+    Args:
+        trainer: at its start.
+        memory_mb: the limit for decoded images.
+        reporter: receives the warning.
+    """
+    anchors, capture = trainer.model.anchors, trainer.scene.capture
+    if trainer.model.device.type != "cpu" or not len(anchors):
+        return
+    views = capture.train_indices[:: -(-len(capture.train_indices) // _VIEWS)]
+    counts = [len(anchors_in_view(anchors, *frustum(trainer.scene.camera(index)))) for index in views]
+    each = bytes_per_anchor(anchors.layout, max(counts) / len(anchors))
+    most, rest = max(trainer.settings.max_anchors, len(anchors)), _BASE + memory_mb * 1e6
+    free = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    if rest + most * each > free:
+        fits = max(int((free - rest) / each) // _ROUNDING, 1) * _ROUNDING
+        reporter.warning(
+            f"With {most:,} anchors, this training may take {(rest + most * each) / 1e9:.0f} GB of memory, and "
+            f"{free / 1e9:.0f} GB are free; --max-anchors {fits} fits, and `split` divides larger models into cells."
+        )
