@@ -47,8 +47,8 @@ class _WithoutLabels(step.ViewStep):
 class LearnableStep(_WithoutLabels):
     """Semantic features, blended and decoded per pixel."""
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, *arguments: Any, **words: Any) -> None:
+        super().__init__(*arguments, **words)
         generator = torch.Generator().manual_seed(self.settings.seed)
         self.encoder = nn.Linear(self.settings.layout.features, CHANNELS)
         self.decoder = nn.Linear(CHANNELS, len(self.model.classes))

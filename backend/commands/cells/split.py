@@ -52,6 +52,8 @@ def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         unseen = first_unseen(division.cells)
         if unseen is not None:
             raise InputError(f"No view shows cell {unseen}; use fewer --cells.")
+        # First, so that a stop in between leaves no division without its parts.
+        folders.division.unlink(missing_ok=True)
         if folders.folder.exists():
             shutil.rmtree(folders.folder)
         make_folder(folders.coarse)
