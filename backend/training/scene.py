@@ -131,7 +131,7 @@ class Scene:
         return image, wanted
 
     def expect(self, keys: Sequence[_Key]) -> None:
-        """Begin to read the targets that will be asked for next, of which there should be `read_ahead`.
+        """Begin to read the targets that will be asked for: the next one, and `read_ahead` that follow.
 
         What fails is raised when the target is asked for. Others that were expected before are no longer.
         """
@@ -173,6 +173,7 @@ class Scene:
 
     def forget(self, shrink: float = 1.0) -> None:
         """Clear the cache of targets, and multiply its memory limit by `shrink`."""
+        self.expect([])
         with self._lock:
             self._held.clear()
             self._bytes = 0

@@ -188,8 +188,9 @@ class ViewStep:
             self.colors.restore(tensors)
 
     def expect(self, indices: Sequence[int], progress: float) -> None:
-        """Begin to read the photos of the views that follow, as many as the scene reads ahead."""
-        self.scene.expect([(index, self._downscale(index, progress)) for index in indices[: self.scene.read_ahead]])
+        """Begin to read the photos of the next view and of those that follow, as many as the scene reads ahead."""
+        next_ones = indices[: 1 + self.scene.read_ahead]
+        self.scene.expect([(index, self._downscale(index, progress)) for index in next_ones])
 
     def _downscale(self, index: int, progress: float) -> int:
         view = self.scene.capture.views[index]

@@ -361,7 +361,7 @@ class Trainer:
         if not p.queue:
             views = [index for index in self.scene.capture.train_indices if index not in p.watched]
             p.queue = self.rng.permutation(views).tolist()
-        self.view_step.expect(p.queue[-2::-1], progress)
+        self.view_step.expect(p.queue[::-1], progress)
         gradients = self.view_step.compute(
             p.queue[-1], progress, overfitting.dropout_at(p, progress), alone=p.step % ALONE_EVERY == 0
         )
@@ -399,6 +399,8 @@ class Trainer:
         a = model.anchors
         kept = torch.ones(len(a), dtype=torch.bool, device=model.device)
         kept[fault.unrecoverable] = False
+        # Those were finite before the training, and are none of its business.
+        kept[: self.region.fixed] = True
         a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
         kept = kept[self.region.fixed :]
         self.row_optimizer.take(kept, 0)

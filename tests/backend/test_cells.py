@@ -138,7 +138,7 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     seams = begin_seams(coarse, division, joined, 5, cameras)
     on_seams = len(seams[0]["anchors.ids"]) - Region.of(seams[1]).fixed
     assert 0 < on_seams < len(joined["ids"]) / 2
-    tensors, state = merged(coarse, division, joined, 5, seams, whole.progress)
+    tensors, state = merged(coarse, division, joined, 5, seams, whole.progress, "0f")
     order, wanted = (np.lexsort(found.T) for found in (tensors["anchors.positions"], expected["positions"]))
     for name, values in expected.items():
         assert np.array_equal(tensors[f"anchors.{name}"][order], values[wanted]), name
@@ -234,6 +234,30 @@ def test_cells_are_trained_and_merged_by_commands(divided, run_command):
             assert np.array_equal(tensors[name.removeprefix("mean.")], value), "all parts share the heads"
     assert run_command("evaluate", divided).code == EXIT_DONE
     assert json.loads((divided / "objectgs.json").read_text())["training"]["steps"] == 130
+
+
+def test_cells_of_a_former_model_or_division_do_not_count(divided, divided_once, run_command):
+    for number in range(2):
+        assert run_command("train-cell", divided, "--cell", number, "--steps", 6).code == EXIT_DONE
+    trained = run_command("train", divided_once[0], "--out", divided, "--steps", 70, *SMALL)
+    assert trained.code == EXIT_DONE
+    before = (divided / "checkpoint" / CURRENT).read_bytes()
+    for words in (("merge", divided), ("split", divided, "--cells", 2)):
+        assert_rejected(run_command(*words), "was changed", "split --restart")
+    assert (divided / "checkpoint" / CURRENT).read_bytes() == before
+    part = json.loads((divided / "cells" / "0" / "part.json").read_text())
+    (divided / "cells" / "0" / "part.json").write_text(json.dumps({**part, "made_of": ["another"]}))
+    result = run_command("train-cell", divided, "--cell", 0, "--steps", 4, "--json")
+    assert result.events[-1]["steps"] == 4, "it begins anew"
+
+
+def test_cells_without_overlap_merge_and_merge_again(divided, run_command):
+    assert run_command("split", divided, "--cells", 2, "--overlap", 0, "--restart").code == EXIT_DONE
+    for number in range(2):
+        assert run_command("train-cell", divided, "--cell", number, "--steps", 6).code == EXIT_DONE
+    for _ in range(2):
+        assert run_command("merge", divided).code == EXIT_DONE
+        assert load_checkpoint(divided / "checkpoint")[1]["progress"]["step"] == 60 + 12
 
 
 def test_stopped_cell_and_merge_go_on(divided, run_command, monkeypatch):

@@ -16,19 +16,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import SafetensorError, safe_open
 
 from ...capture import Capture
 from ...labels import correct_masks
 from ...raster import Camera, devices
 from ...shared.errors import InputError
-from ...shared.formats.json_file import read_json, write_json
+from ...shared.formats.json_file import parse_json, read_json, write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.formats.typed import typed
 from ...shared.reconstruction.checkpoint import CURRENT
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StoppingReporter
 from ...training.cells.division import NO_CELL, Division, read_division
-from ...training.cells.parts import Checkpoint
+from ...training.cells.parts import MERGED_OF, Checkpoint
 from ...training.scene import Scene
 from ...training.state import require_checkpoint
 from ..folder import Trained, open_trained
@@ -62,6 +63,7 @@ class Divided:
         capture: its capture with corrected masks, as for the training of the coarse model.
         folders: the folders of the cells.
         division: the cells.
+        key: hash of cells.json, to which the records of its parts refer.
         coarse: checkpoint of the coarse model.
         cell_of: (N,) the cell of each of its anchors.
     """
@@ -70,6 +72,7 @@ class Divided:
     capture: Capture
     folders: CellFolders
     division: Division
+    key: str
     coarse: Checkpoint
     cell_of: np.ndarray
 
@@ -101,7 +104,7 @@ def open_divided(options: argparse.Namespace, reporter: StoppingReporter) -> Div
     if digest_of(folders.coarse) != division.checkpoint:
         raise InputError(f"{folders.division} belongs to another model than {folders.coarse}; run `split` again.")
     return Divided(
-        trained, with_corrected_masks(trained), folders, division, coarse,
+        trained, with_corrected_masks(trained), folders, division, _digest(folders.division), coarse,
         cells_of(division, trained.scene, coarse[0]["anchors.positions"]),
     )  # fmt: skip
 
@@ -117,18 +120,40 @@ def with_corrected_masks(trained: Trained) -> Capture:
     if not trained.capture.has_masks:
         return trained.capture
     ids = read_points(trained.folder.points).ids
-    return correct_masks(trained.capture, ids, ignore_gaps=trained.scene.supervise_background)[0]
+    scene = trained.scene
+    return correct_masks(trained.capture, ids, ignore_gaps=scene.supervise_background and not scene.zero_is_object)[0]
 
 
 def read_part(folder: Path) -> Checkpoint:
     """Return the checkpoint in a folder of cells/; raise InputError if there is none or it is damaged."""
-    tensors, state, _ = require_checkpoint(folder)
+    tensors, state, warning = require_checkpoint(folder)
+    if warning:
+        # An older one is not what its record describes.
+        raise InputError(f"{folder / CURRENT} is missing or damaged; train this part again.")
     return tensors, state
+
+
+def require_unchanged(folder: Reconstruction, division: Division, folders: CellFolders) -> None:
+    """Raise InputError if a reconstruction's model is neither the divided one nor merged of its cells."""
+    try:
+        # Without the tensors, which may take much of the memory.
+        with safe_open(folder.checkpoint / CURRENT, framework="numpy") as file:
+            merged_of = parse_json(file.metadata()["state"]).get(MERGED_OF)
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{folder.checkpoint / CURRENT} is missing or damaged; train again.") from error
+    if merged_of != _digest(folders.division) and digest_of(folder.checkpoint) != division.checkpoint:
+        raise InputError(
+            f"The model in {folder.folder} was changed after it was divided; use `split --restart` to divide it anew."
+        )
 
 
 def digest_of(folder: Path) -> str:
     """Return a hash of the checkpoint in a folder of cells/."""
-    with (folder / CURRENT).open("rb") as file:
+    return _digest(folder / CURRENT)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
@@ -136,8 +161,8 @@ def digest_of(folder: Path) -> str:
 class PartRecord:
     """part.json: what a part was made of, and how far it is.
 
-    made_of: hashes of the checkpoints that its training began with. complete: whether that is complete, of `steps`
-    that took `seconds`, with so many `anchors` in the core of the cell.
+    made_of: hashes of cells.json and of the checkpoints that its training began with. complete: whether that is
+    complete, of `steps` that took `seconds`, with so many `anchors` in the core of the cell.
     """
 
     made_of: tuple[str, ...]

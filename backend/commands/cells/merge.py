@@ -32,6 +32,7 @@ from .folder import (
     open_divided,
     read_part,
     read_part_record,
+    require_unchanged,
     write_part_record,
 )
 
@@ -56,9 +57,10 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     folder, device = divided.trained.folder, divided.trained.model.device
     cells = _finished_cells(divided)
     with locked(folder.folder):
+        require_unchanged(folder, divided.division, divided.folders)
         reporter.begin(_JOIN, f"Joining {len(cells)} cells")
         parts = [divided.folders.cell(number) / CHECKPOINT for number in range(len(cells))]
-        of = (divided.division.checkpoint, *map(digest_of, parts))
+        of = (divided.key, *map(digest_of, parts))
         counts = [cell.anchors for cell in cells]
         joined = join_cells(divided.coarse, divided.division, divided.cell_of, map(read_part, parts), counts)
         steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
@@ -79,6 +81,7 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             surroundings,
             read_part(divided.folders.seams / CHECKPOINT),
             progress,
+            divided.key,
         )
         save_checkpoint(folder.checkpoint, tensors, state)
         del tensors, joined
@@ -99,7 +102,7 @@ def _finished_cells(divided: Divided) -> list[PartRecord]:
     found = []
     for number in range(len(divided.division.cells)):
         record = read_part_record(divided.folders.cell(number))
-        if record is None or not record.complete or record.made_of != (divided.division.checkpoint,):
+        if record is None or not record.complete or record.made_of != (divided.key,):
             raise InputError(
                 f"Cell {number} of {divided.trained.folder.folder} is not trained to its end; run "
                 f"`train-cell {divided.trained.folder.folder} --cell {number}` first."
@@ -137,5 +140,9 @@ def _train_seams(
         trainer = Trainer.restore(capture, *begun, memory, device, scene.gains)
         write_part_record(folder, PartRecord(of))
     reporter.begin(_TRAIN, f"Training {len(trainer.model.anchors) - trainer.region.fixed:,} anchors where cells meet")
-    trainer.run(Budget(steps, first=FIRST), folder / CHECKPOINT, reporter.reporter, stop=reporter.stop)
+    if capture.train_indices:
+        trainer.run(Budget(steps, first=FIRST), folder / CHECKPOINT, reporter.reporter, stop=reporter.stop)
+    else:
+        # Cells without overlap have no seams.
+        trainer.save(folder / CHECKPOINT)
     return trainer.progress

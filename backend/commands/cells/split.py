@@ -16,7 +16,7 @@ from ...training.cells.division import Division, divide, read_division, write_di
 from ...training.cells.visibility import first_unseen, shares, with_views
 from ..folder import READ, open_trained
 from ..stages import stage
-from .folder import CellFolders, cells_of, digest_of
+from .folder import CellFolders, cells_of, digest_of, require_unchanged
 
 _VIEWS = "views"
 
@@ -29,7 +29,9 @@ def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     scene, model, views = trained.scene, trained.model, trained.capture.views
     with locked(trained.folder.folder), stage(trained.folder, "split"):
         if folders.division.exists() and not options.restart:
-            _require_same(read_division(folders.division), options)
+            division = read_division(folders.division)
+            _require_same(division, options)
+            require_unchanged(trained.folder, division, folders)
             reporter.status("The model is already divided like that; use --restart to discard its cells.")
             reporter.done(cells=options.cells, folder=str(folders.folder))
             return

@@ -18,7 +18,7 @@ from ...training.trainer import Trainer
 from ..folder import READ, memory_for_targets
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
-from .folder import CHECKPOINT, Divided, PartRecord, open_divided, write_part_record
+from .folder import CHECKPOINT, Divided, PartRecord, open_divided, read_part_record, write_part_record
 
 FIRST = 0.1
 """Progress at the first step: the coarse model is there, and anchors begin to grow."""
@@ -41,10 +41,12 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     make_folder(folder)
     with locked(folder):
         remove_abandoned(folder)
-        if options.restart:
-            shutil.rmtree(folder / CHECKPOINT, ignore_errors=True)
+        record, before = PartRecord((divided.key,)), read_part_record(folder)
+        if options.restart or before is None or before.made_of != record.made_of:
+            write_part_record(folder, record)
+            if (folder / CHECKPOINT).exists():
+                shutil.rmtree(folder / CHECKPOINT)
         trainer = _open(divided, number, options, reporter)
-        record = PartRecord((division.checkpoint,))
         if budget.progress(trainer.progress) >= 1:
             reporter.status(
                 f"Cell {number} is already trained for {trainer.progress.step} steps; specify more --minutes or "

@@ -15,6 +15,7 @@ import torch
 from ...model.anchors import Anchors
 from ...model.object_model import anchors_in_view
 from ...raster import Camera
+from ...shared.errors import InputError
 from ..budget import TrainingProgress
 from ..settings import Settings
 from ..step import frustum
@@ -26,6 +27,9 @@ Checkpoint = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 NOWHERE: Bounds = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 """Bounds in which no anchors are added."""
+
+MERGED_OF = "merged_of"
+"""Entry of the state of a merged checkpoint with the hash of the division."""
 
 _OF_ANCHORS = ("positions", "rows", "ids")
 
@@ -101,15 +105,22 @@ def join_cells(
 
     Returns:
         Positions, rows and IDs, as from `anchors_of`.
+
+    Raises:
+        InputError: a cell has another number of anchors.
     """
     of_none = {name: values[cell_of == NO_CELL] for name, values in anchors_of(shared).items()}
     end = len(of_none["ids"])
     joined = {name: np.empty((end + sum(counts), *values.shape[1:]), values.dtype) for name, values in of_none.items()}
     for name, values in of_none.items():
         joined[name][:end] = values
-    for cell, checkpoint in zip(division.cells, cells, strict=True):
+    for cell, checkpoint, count in zip(division.cells, cells, counts, strict=True):
         fixed, anchors = Region.of(checkpoint[1]).fixed, anchors_of(checkpoint)
         here = fixed + np.flatnonzero(inside(anchors["positions"][fixed:], cell.core))
+        if len(here) != count:
+            raise InputError(
+                f"A cell has {len(here)} anchors instead of {count}; it was changed, so run `merge` again."
+            )
         for name, values in anchors.items():
             joined[name][end : end + len(here)] = values[here]
         end += len(here)
@@ -140,6 +151,7 @@ def merged(
     surroundings: int,
     seams: Checkpoint,
     progress: TrainingProgress,
+    key: str,
 ) -> Checkpoint:
     """Return the checkpoint of the whole model, after the training of the seams.
 
@@ -147,6 +159,7 @@ def merged(
         shared, division, anchors, surroundings: as for `begin_seams`.
         seams: checkpoint of the trained seams.
         progress: of the whole training.
+        key: hash of the division, which the state keeps until the model is trained further.
 
     The joined anchors are changed in place.
     """
@@ -159,7 +172,7 @@ def merged(
         # Anchors whose parameters were not finite have been removed.
         anchors = {name: np.concatenate([anchors[name][~of_seams], trained[name][fixed:]]) for name in _OF_ANCHORS}
     made = _untrained(tensors, anchors, 0, Settings(**state["settings"]))
-    return made, {**state, "progress": {**progress.__dict__}}
+    return made, {**state, "progress": {**progress.__dict__}, MERGED_OF: key}
 
 
 def _untrained(
