@@ -15,7 +15,7 @@ import torch
 
 from backend.model.checkpoint import CURRENT, load_checkpoint, save_checkpoint
 from backend.raster import devices
-from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
+from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.training.cells.division import NO_CELL, Cell, Division, divide, read_division, write_division
 from backend.training.cells.parts import anchors_of, begin_cell, begin_seams, join_cells, merged
 from backend.training.cells.region import EVERYWHERE, Region, inside
@@ -47,6 +47,18 @@ def test_division_without_overlap_has_no_seams():
     positions = np.random.default_rng(0).normal(size=(500, 3))
     cells = divide(positions, 4, 0.0)
     assert not Division("", 0.0, tuple(cells)).on_seams(positions).any()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7, 0.999])
+def test_no_cell_is_empty_where_many_anchors_have_the_same_coordinates(share):
+    positions = np.random.default_rng(0).random((1000, 3)) * [5, 1, 1]
+    positions[: int(1000 * share), 0] = positions[:, 0].min()
+    for count in (2, 3, 4):
+        cells = divide(positions, count, 0.2)
+        assert len(cells) == count and all(cell.anchors > 0 for cell in cells)
+        assert sum(cell.anchors for cell in cells) == 1000
+    with pytest.raises(InputError, match="fewer --cells"):
+        divide(np.ones((50, 3)), 2, 0.2)
 
 
 def test_division_survives_its_file(tmp_path):
@@ -291,10 +303,22 @@ def test_stopped_cell_and_merge_go_on(divided, run_command, monkeypatch):
 def test_damaged_files_of_cells_are_named(divided, run_command):
     division = divided / "cells" / "cells.json"
     text = division.read_text()
-    for broken in ("{", "[]", json.dumps({**json.loads(text), "cells": [{"core": 3}]})):
+    stored = json.loads(text)
+    first = stored["cells"][0]
+    low, high = (
+        [-9.0 if x is None else x for x in first["core"][0]],
+        [9.0 if x is None else x for x in first["core"][1]],
+    )
+    cells = (
+        [], [{"core": 3}], [{**first, "core": [low, low]}], [{**first, "core": [high, low]}],
+        [{**first, "bounds": [low, low]}],
+    )  # fmt: skip
+    division.write_text("{")
+    assert_rejected(run_command("train-cell", divided, "--cell", 0), "cells.json")
+    for broken in ("[]", *(json.dumps({**stored, "cells": each}) for each in cells)):
         division.write_text(broken)
-        assert_rejected(run_command("train-cell", divided, "--cell", 0), "cells.json")
-    division.write_text(json.dumps({**json.loads(text), "checkpoint": "00"}))
+        assert_rejected(run_command("train-cell", divided, "--cell", 0), "cells.json", "split --restart")
+    division.write_text(json.dumps({**stored, "checkpoint": "00"}))
     assert_rejected(run_command("train-cell", divided, "--cell", 0), "split")
     division.write_text(text)
     (divided / "cells" / "0").mkdir()

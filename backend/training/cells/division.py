@@ -79,6 +79,9 @@ def divide(positions: np.ndarray, count: int, overlap: float) -> list[Cell]:
         positions: (N, 3) float64, the anchors in scene units, without those of distant surroundings.
         count: number of cells.
         overlap: by which fraction of its edge a cell is trained beyond its core, half of it on either side.
+
+    Raises:
+        InputError: the anchors lie in too few places for that many cells.
     """
     low, high = np.percentile(positions, [_OUTLIERS, 100 - _OUTLIERS], axis=0)
     cells = []
@@ -90,12 +93,17 @@ def divide(positions: np.ndarray, count: int, overlap: float) -> list[Cell]:
 
 
 def _cut(positions: np.ndarray, count: int, box: Bounds) -> list[Bounds]:
-    """Cut a box into `count` boxes; positions: the anchors in it."""
+    """Cut a box into `count` boxes, none of them empty; positions: the anchors in it."""
     if count == 1:
         return [box]
     extents = np.ptp(np.percentile(positions, [_OUTLIERS, 100 - _OUTLIERS], axis=0), axis=0)
-    axis, of_first = int(np.argmax(extents)), count // 2
-    at = float(np.quantile(positions[:, axis], of_first / count))
+    of_first = count // 2
+    for axis in np.argsort(-extents, kind="stable").tolist():
+        at = _place_of_cut(positions[:, axis], of_first, count)
+        if at is not None:
+            break
+    else:
+        raise InputError("The anchors lie in too few places for so many cells; use fewer --cells.")
     low, high = (np.array(corner) for corner in box)
     end, start = high.copy(), low.copy()
     end[axis] = start[axis] = at
@@ -104,6 +112,23 @@ def _cut(positions: np.ndarray, count: int, box: Bounds) -> list[Bounds]:
         *_cut(positions[before], of_first, _box(low, end)),
         *_cut(positions[~before], count - of_first, _box(start, high)),
     ]
+
+
+def _place_of_cut(coordinates: np.ndarray, of_first: int, count: int) -> float | None:
+    """Return where anchors are cut so that each of `count` cells, `of_first` of them before it, can have some.
+
+    Their shares are equal, or as nearly as anchors with the same coordinate allow; None if none of them can be cut.
+    """
+    at, total = float(np.quantile(coordinates, of_first / count)), len(coordinates)
+    least, most = of_first, total - (count - of_first)
+    if least <= (coordinates < at).sum() <= most:
+        return at
+    places, numbers = np.unique(coordinates, return_counts=True)
+    before = np.cumsum(numbers) - numbers
+    possible = np.flatnonzero((before >= least) & (before <= most))
+    if not len(possible):
+        return None
+    return float(places[possible[np.argmin(np.abs(before[possible] - total * of_first / count))]])
 
 
 def _box(low: np.ndarray, high: np.ndarray) -> Bounds:
@@ -141,13 +166,20 @@ def read_division(path: Path) -> Division:
         stored = read_json(path)
         if stored["format"] != FORMAT:
             raise ValueError("another format")
-        cells = tuple(
-            Cell(bounds_of(cell["core"]), bounds_of(cell["bounds"]), int(cell["anchors"]), _names(cell["views"]))
-            for cell in stored["cells"]
-        )
+        cells = tuple(_cell(cell) for cell in stored["cells"])
+        if not cells:
+            raise ValueError("there are no cells")
         return Division(str(stored["checkpoint"]), float(stored["overlap"]), cells, _names(stored["seam_views"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} is damaged ({error}); run `split` on the reconstruction again.") from error
+        raise InputError(f"{path} is damaged ({error}); use `split --restart` to divide the model anew.") from error
+
+
+def _cell(stored: Any) -> Cell:
+    core, bounds = bounds_of(stored["core"]), bounds_of(stored["bounds"])
+    (low, high), (first, last) = np.array(core), np.array(bounds)
+    if not (low < high).all() or (first > low).any() or (last < high).any():
+        raise ValueError("a cell is not valid")
+    return Cell(core, bounds, int(stored["anchors"]), _names(stored["views"]))
 
 
 def _names(stored: Any) -> tuple[str, ...]:
