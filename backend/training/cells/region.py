@@ -18,10 +18,13 @@ class Region:
     """The part of a model that a training changes; the default is all of it.
 
     Attributes:
-        fixed: number of anchors, the first of the model, that are drawn but not changed. If there are any, the heads,
-            the background and the corrections of the photos' colors are not changed either, since other regions share
-            them.
-        bounds: lower and upper corner, in scene units, of the box in which anchors may be added.
+        fixed: number of anchors, the first of the model, that are drawn, but neither changed nor removed, and from
+            which none grow.
+        bounds: lower and upper corner, in scene units, of the box in which anchors may be added; infinite where it has
+            no end. The lower faces belong to it.
+
+    Unless the region is the whole model, the heads, the background and the corrections of the photos' colors are not
+    changed either, since other regions share them.
     """
 
     fixed: int = 0
