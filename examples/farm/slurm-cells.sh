@@ -5,22 +5,35 @@
 #     examples/farm/slurm-cells.sh CAPTURE OUT CELLS COARSE_MINUTES CELL_MINUTES [option of sbatch ...]
 #
 # Run it in the folder of ObjectGS. PYTHON names the backend's Python (.venv/bin/python). The folders must be the same on
-# all nodes. A job that was stopped may be submitted again, and goes on.
+# all nodes, whose jobs need nothing of this shell's environment. A job that was stopped may be submitted again, and goes
+# on.
 set -euo pipefail
 
 if [ "${1:-}" = "cell" ]; then
-    exec "$PYTHON" -m backend train-cell "$2" --cell "$SLURM_ARRAY_TASK_ID" --minutes "$3"
+    exec "$2" -m backend train-cell "$3" --cell "$SLURM_ARRAY_TASK_ID" --minutes "$4"
 fi
 
 capture=$1 out=$2 cells=$3 coarse=$4 minutes=$5
 shift 5
-export PYTHON=${PYTHON:-.venv/bin/python}
-submit() { sbatch --parsable --export=ALL --chdir="$PWD" "$@"; }
+python=${PYTHON:-.venv/bin/python}
+
+# Prints the number of the job, without the cluster that may follow it.
+submit() {
+    local id
+    id=$(sbatch --parsable --chdir="$PWD" "$@")
+    echo "${id%%;*}"
+}
+
+# Prints a command of the backend for any shell; the wrapped ones are run by sh.
+backend() {
+    local word
+    for word in "$python" -m backend "$@"; do
+        printf "'%s' " "${word//\'/\'\\\'\'}"
+    done
+}
 
 train=$(submit "${@}" --job-name=objectgs-train --wrap \
-    "$(printf '%q ' "$PYTHON" -m backend train "$capture" --out "$out" --minutes "$coarse") && \
-     $(printf '%q ' "$PYTHON" -m backend split "$out" --cells "$cells")")
+    "$(backend train "$capture" --out "$out" --minutes "$coarse") && $(backend split "$out" --cells "$cells")")
 array=$(submit "${@}" --job-name=objectgs-cell --dependency="afterok:$train" --array="0-$((cells - 1))" \
-    "$0" cell "$out" "$minutes")
-submit "${@}" --job-name=objectgs-merge --dependency="afterok:$array" --wrap \
-    "$(printf '%q ' "$PYTHON" -m backend merge "$out")"
+    "$0" cell "$python" "$out" "$minutes")
+submit "${@}" --job-name=objectgs-merge --dependency="afterok:$array" --wrap "$(backend merge "$out")"

@@ -80,36 +80,60 @@ def test_code_that_starts_the_backend_runs_it_from_any_folder(tmp_path):
     assert "usage: python -m backend merge" in shown
 
 
-def test_openjd_template_trains_cells_between_split_and_merge():
+def test_openjd_template_trains_cells_between_split_and_merge(tmp_path):
     template = json.loads((FARM / "openjd-cells.json").read_text())
     values = {p["name"]: str(p.get("default", "/path")) for p in template["parameterDefinitions"]}
+    # A stand-in for ObjectGS, so that the code that starts it runs, too.
+    (tmp_path / "backend").mkdir()
+    (tmp_path / "backend" / "__init__.py").touch()
+    (tmp_path / "backend" / "__main__.py").write_text("import json, sys\nprint(json.dumps(sys.argv[1:]))\n")
+    values |= {"Capture": "/here/capture", "Out": "/o", "ObjectGS": str(tmp_path), "Cells": "3"}
     steps = {step["name"]: step for step in template["steps"]}
     assert {name: [d["dependsOn"] for d in step.get("dependencies", [])] for name, step in steps.items()} == {
         "Train": [], "Split": ["Train"], "Cell": ["Split"], "Merge": ["Cell"]
     }  # fmt: skip
-    commands = {}
-    for name, step in steps.items():
-        words = step["script"]["actions"]["onRun"]["args"]
-        filled = [re.sub(r"{{(Task\.)?Param\.(\w+)}}", lambda m: "2" if m[1] else values[m[2]], w) for w in words]
-        commands[name] = parsed(filled)
-    assert [o.command for o in commands.values()] == ["train", "split", "train-cell", "merge"]
-    assert commands["Cell"].cell == 2 and commands["Split"].cells == int(values["LastCell"]) + 1
+
+    def run(step, cell=""):
+        filled = [
+            re.sub(r"{{(Task\.)?Param\.(\w+)}}", lambda m: cell if m[1] else values[m[2]], word)
+            for word in step["script"]["actions"]["onRun"]["args"]
+        ]
+        shown = subprocess.run([sys.executable, *filled], check=True, capture_output=True, text=True).stdout
+        return build_parser().parse_args(json.loads(shown))
+
+    (tasks,) = steps["Cell"]["parameterSpace"]["taskParameterDefinitions"]
+    assert (tasks["name"], tasks["range"]) == ("Cell", "1-{{Param.Cells}}")
+    assert [run(steps["Cell"], number).cell for number in ("1", values["Cells"])] == [0, int(values["Cells"]) - 1]
+    found = [run(step, "1") for step in steps.values()]
+    assert [o.command for o in found] == ["train", "split", "train-cell", "merge"] and found[1].cells == 3
+    assert all(o.capture == Path(values["Capture"]) for o in found), "each session may have another path of it"
+    kinds = {p["name"]: p.get("dataFlow") for p in template["parameterDefinitions"]}
+    assert kinds["Out"] == "NONE", "steps write to one folder, not to attachments of their own"
 
 
 def test_slurm_script_submits_cells_as_an_array(tmp_path):
     if sys.platform == "win32":
         pytest.skip("the script is for bash")
     log, stub = tmp_path / "log", tmp_path / "sbatch"
-    stub.write_text(f'#!/bin/bash\nprintf "%s\\n" "$*" >> {log}\nwc -l < {log}\n')
+    # With the numbers of a site of several clusters. A wrapped command is run by sh, which shows its words.
+    stub.write_text(
+        f'#!/bin/bash\nprintf "%s\\n" "${{*//$\'\\n\'/ }}" >> {log}\n'
+        f'while [ $# -gt 0 ]; do [ "$1" = --wrap ] && sh -c "$2" >> {tmp_path}/wrapped; shift; done\n'
+        f'echo "$(wc -l < {log});east"\n'
+    )
     stub.chmod(0o755)
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHON": "echo"}
-    words = [str(FARM / "slurm-cells.sh"), "/my capture", "/o", "3", "10", "20", "--partition=gpu"]
-    subprocess.run(words, check=True, capture_output=True, env=environment)
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHON": "echo", "LC_ALL": "C"}
+    words = [str(FARM / "slurm-cells.sh"), "/my café's", "/o", "3", "10", "20", "--partition=gpu", "--export=NONE"]
+    shown = subprocess.run(words, check=True, capture_output=True, env=environment, text=True).stdout
+    assert shown.split() == ["3"]
     train, cells, merge = log.read_text().splitlines()
-    assert all("--partition=gpu" in line for line in (train, cells, merge))
-    assert "train /my\\ capture --out /o --minutes 10" in train and "split /o --cells 3" in train
-    assert "--dependency=afterok:1" in cells and "--array=0-2" in cells
-    assert "--dependency=afterok:2" in merge and "merge /o" in merge
+    assert all("--partition=gpu" in line and "--export=ALL" not in line for line in (train, cells, merge))
+    assert (tmp_path / "wrapped").read_text(encoding="utf-8").splitlines() == [
+        "-m backend train /my café's --out /o --minutes 10", "-m backend split /o --cells 3", "-m backend merge /o"
+    ]  # fmt: skip
+    assert "--dependency=afterok:1 " in cells and "--array=0-2" in cells
+    assert "--dependency=afterok:2 " in merge
+    del environment["PYTHON"]
     task = subprocess.run(
         [words[0], *cells.split("slurm-cells.sh ")[1].split()], check=True, capture_output=True, text=True,
         env={**environment, "SLURM_ARRAY_TASK_ID": "2"},
