@@ -132,7 +132,10 @@ def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: 
 
 
 class Trained(NamedTuple):
-    """An opened reconstruction with its trained model."""
+    """An opened reconstruction with its trained model.
+
+    is_latest: whether the model is that of the latest checkpoint, and not of an older one since that is damaged.
+    """
 
     folder: Reconstruction
     capture: Capture
@@ -141,11 +144,22 @@ class Trained(NamedTuple):
     progress: TrainingProgress
     plan: Plan
     training: TrainingRecord
+    is_latest: bool
 
     @property
     def trained_on(self) -> str:
         """Name of the device that the model was trained on, as from `backend.raster.devices.name_of`."""
         return self.training.device
+
+
+def require_reconstruction(folder: Reconstruction) -> None:
+    """Raise InputError if a folder does not exist, or is not a reconstruction."""
+    if not folder.folder.is_dir():
+        raise InputError(f"{folder.folder} does not exist; specify the folder given to `train --out`.")
+    if not folder.settings.exists():
+        raise InputError(
+            f"{folder.folder} is not a reconstruction, since it has no {folder.settings.name}; train first."
+        )
 
 
 def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Path | None = None) -> Trained:
@@ -165,12 +179,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Pa
     reporter.begin(READ, "Reading the reconstruction")
     device = choose_device(options.device, reporter)
     folder = Reconstruction(options.folder)
-    if not folder.folder.is_dir():
-        raise InputError(f"{folder.folder} does not exist; specify the folder given to `train --out`.")
-    if not folder.settings.exists():
-        raise InputError(
-            f"{folder.folder} is not a reconstruction, since it has no {folder.settings.name}; train first."
-        )
+    require_reconstruction(folder)
     record = read_record(folder)
     model, state, warning = load_model(checkpoint or folder.checkpoint, device)
     if warning:
@@ -207,7 +216,7 @@ def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Pa
         capture, model.classes, model.normalization, zero_is_object, memory_for_targets(options),
         supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
-    return Trained(folder, capture, model, scene, progress_of(state), plan, training)
+    return Trained(folder, capture, model, scene, progress_of(state), plan, training, warning is None)
 
 
 def outdate_results(folder: Reconstruction) -> None:

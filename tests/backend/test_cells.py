@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,23 @@ import pytest
 import safetensors.numpy
 import torch
 
+from backend.commands.cells import folder as opening
+from backend.commands.cells import split
 from backend.model.checkpoint import CURRENT, load_checkpoint, save_checkpoint
 from backend.raster import devices
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
+from backend.shared.reconstruction.checkpoint import PREVIOUS
+from backend.shared.reconstruction.lock import locked
 from backend.training.cells.division import NO_CELL, Cell, Division, divide, read_division, write_division
-from backend.training.cells.parts import anchors_of, begin_cell, begin_seams, join_cells, merged
+from backend.training.cells.parts import (
+    anchors_of,
+    begin_cell,
+    begin_seams,
+    for_parts,
+    join_cells,
+    merged,
+    without_anchors,
+)
 from backend.training.cells.region import EVERYWHERE, Region, inside
 from backend.training.cells.visibility import shares
 from backend.training.settings import GROW_UNTIL, Settings
@@ -143,10 +156,13 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     division, cell_of = in_two(coarse)
     cell_of[:5] = NO_CELL
     cameras = [whole.scene.camera(i) for i in capture.train_indices]
+    expected, coarse = anchors_of(coarse), for_parts(coarse)
+    assert not {name for name in coarse[0] if name.startswith(("adam.", "growth.", "mean.rows"))}
     cells = [begin_cell(coarse, division, number, cell_of, cameras) for number in range(2)]
     counts = [int((cell_of == number).sum()) for number in range(2)]
     joined = join_cells(coarse, division, cell_of, cells, counts)
-    expected = anchors_of(coarse)
+    coarse = without_anchors(coarse)
+    assert not {name for name in coarse[0] if name.startswith("anchors.")}
     seams = begin_seams(coarse, division, joined, 5, cameras)
     on_seams = len(seams[0]["anchors.ids"]) - Region.of(seams[1]).fixed
     assert 0 < on_seams < len(joined["ids"]) / 2
@@ -298,6 +314,10 @@ def test_stopped_cell_and_merge_go_on(divided, run_command, monkeypatch):
     monkeypatch.undo()
     result = run_command("merge", divided, "--steps", 12)
     assert result.code == EXIT_DONE and load_checkpoint(divided / "checkpoint")[1]["progress"]["step"] == 60 + 48 + 12
+    for broken in ("part.json", f"checkpoint/{CURRENT}"):
+        (divided / "cells" / "seams" / broken).write_text("{")
+        result = run_command("merge", divided, "--steps", 12)
+        assert result.code == EXIT_DONE and "begins anew" in result.err
 
 
 def test_damaged_files_of_cells_are_named(divided, run_command):
@@ -319,11 +339,83 @@ def test_damaged_files_of_cells_are_named(divided, run_command):
         division.write_text(broken)
         assert_rejected(run_command("train-cell", divided, "--cell", 0), "cells.json", "split --restart")
     division.write_text(json.dumps({**stored, "checkpoint": "00"}))
-    assert_rejected(run_command("train-cell", divided, "--cell", 0), "split")
+    assert_rejected(run_command("train-cell", divided, "--cell", 0), "split --restart")
     division.write_text(text)
     (divided / "cells" / "0").mkdir()
     (divided / "cells" / "0" / "part.json").write_text('{"made_of": 3}')
-    assert_rejected(run_command("merge", divided), "part.json", "--restart")
+    assert_rejected(run_command("merge", divided), "part.json", "train-cell", "--restart")
+    assert run_command("train-cell", divided, "--cell", 0, "--steps", 3, "--restart").code == EXIT_DONE
+    assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
+    folder = divided / "cells" / "0" / "checkpoint"
+    shutil.copyfile(folder / CURRENT, folder / PREVIOUS)
+    (folder / CURRENT).unlink()
+    assert_rejected(run_command("merge", divided), "missing")
+    (folder / CURRENT).write_bytes(b"damaged")
+    assert_rejected(run_command("merge", divided), "run `train-cell` for this cell again")
+    assert run_command("train-cell", divided, "--cell", 0, "--steps", 3).code == EXIT_DONE
+    assert run_command("merge", divided).code == EXIT_DONE, "what the message says has helped"
+
+
+def test_damaged_model_is_not_divided(divided, run_command):
+    shutil.copyfile(divided / "checkpoint" / CURRENT, divided / "checkpoint" / PREVIOUS)
+    (divided / "checkpoint" / CURRENT).write_bytes(b"damaged")
+    assert_rejected(run_command("split", divided, "--cells", 2, "--restart"), CURRENT, "train")
+    assert (divided / "cells" / "cells.json").exists()
+
+
+def test_folders_in_use_are_neither_read_nor_deleted(divided, run_command, monkeypatch):
+    for number in range(2):
+        assert run_command("train-cell", divided, "--cell", number, "--steps", 3).code == EXIT_DONE
+    commands = (("merge", divided), ("split", divided, "--cells", 2, "--restart"))
+    with locked(divided / "cells" / "1"):
+        for words in commands:
+            assert_rejected(run_command(*words), "Cell 1", "in use")
+    assert (divided / "cells" / "1" / "part.json").exists()
+    original = opening.open_trained
+
+    def divide_meanwhile(*arguments):
+        path = divided / "cells" / "cells.json"
+        path.write_text(path.read_text() + "\n")
+        return original(*arguments)
+
+    monkeypatch.setattr(opening, "open_trained", divide_meanwhile)
+    assert_rejected(run_command("train-cell", divided, "--cell", 0, "--steps", 6), "divided anew")
+    for module in (opening, split):
+        monkeypatch.setattr(module, "open_trained", None)
+    with locked(divided):
+        for words in commands:
+            assert_rejected(run_command(*words), "in use")
+
+
+def test_coarse_model_is_not_kept_while_cells_are_trained(divided, run_command, monkeypatch):
+    coarse = []
+
+    def watch(name):
+        original = getattr(opening, name)
+
+        def wrapper(*arguments):
+            found = original(*arguments)
+            if name == "open_trained":
+                coarse.append(weakref.ref(found.model))
+            elif arguments[0].name == "coarse":
+                coarse.extend(weakref.ref(value) for key, value in found[0].items() if key.startswith("anchors."))
+            return found
+
+        monkeypatch.setattr(opening, name, wrapper)
+
+    def run(self, *arguments, original=Trainer.run, **options):
+        assert len(coarse) == 4 and not [reference for reference in coarse if reference() is not None]
+        coarse.clear()
+        return original(self, *arguments, **options)
+
+    watch("open_trained")
+    watch("read_part")
+    monkeypatch.setattr(Trainer, "run", run)
+    train = ("train-cell", divided, "--cell", 0, "--steps", 3)
+    assert run_command(*train).code == EXIT_DONE
+    coarse.clear()
+    assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
+    assert run_command("merge", divided).code == EXIT_DONE and not coarse
 
 
 @pytest.mark.long

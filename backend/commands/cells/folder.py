@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -27,12 +28,15 @@ from ...shared.formats.points_ply import read_points
 from ...shared.formats.typed import typed
 from ...shared.reconstruction.checkpoint import CURRENT
 from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.lock import FolderInUse, locked
+from ...shared.reconstruction.record import TrainingRecord
 from ...shared.stopping import StoppingReporter
+from ...training.budget import TrainingProgress
 from ...training.cells.division import NO_CELL, Division, read_division
-from ...training.cells.parts import MERGED_OF, Checkpoint
+from ...training.cells.parts import MERGED_OF, Checkpoint, for_parts
 from ...training.scene import Scene
 from ...training.state import require_checkpoint
-from ..folder import Trained, open_trained
+from ..folder import Trained, open_trained, require_reconstruction
 
 CHECKPOINT = "checkpoint"
 """Name of the folder of a part's checkpoints in that of the part."""
@@ -53,38 +57,63 @@ class CellFolders:
         """Return the folder of a cell's checkpoint, counted from 0."""
         return self.folder / str(number)
 
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the locks of all cells that were begun; raises FolderInUse if one is being trained."""
+        names = [path.name for path in self.folder.iterdir() if path.is_dir()] if self.folder.exists() else []
+        with ExitStack() as held:
+            for number in sorted(int(name) for name in names if name.isdecimal()):
+                try:
+                    held.enter_context(locked(self.cell(number)))
+                except FolderInUse as error:
+                    raise FolderInUse(f"Cell {number} is being trained: {error}") from error
+            yield
+
 
 @dataclass(frozen=True)
 class Divided:
-    """An opened reconstruction that is divided into cells.
+    """An opened reconstruction that is divided into cells, without its coarse model, which may be large.
 
     Attributes:
-        trained: the reconstruction with its coarse model.
+        folder: the reconstruction.
         capture: its capture with corrected masks, as for the training of the coarse model.
+        scene: the capture for trainings.
+        progress, training: of the training of the coarse model.
+        device: where parts are trained.
         folders: the folders of the cells.
         division: the cells.
         key: hash of cells.json, to which the records of its parts refer.
-        coarse: checkpoint of the coarse model.
-        cell_of: (N,) the cell of each of its anchors.
     """
 
-    trained: Trained
+    folder: Reconstruction
     capture: Capture
+    scene: Scene
+    progress: TrainingProgress
+    training: TrainingRecord
+    device: torch.device
     folders: CellFolders
     division: Division
     key: str
-    coarse: Checkpoint
-    cell_of: np.ndarray
+
+    def read_coarse(self) -> tuple[Checkpoint, np.ndarray]:
+        """Read what parts are made of: the checkpoint of the coarse model, and the cell of each anchor, (N,)."""
+        coarse = for_parts(read_part(self.folders.coarse))
+        return coarse, cells_of(self.division, self.scene, coarse[0]["anchors.positions"])
 
     def cameras(self, names: Collection[str]) -> list[Camera]:
         """Return the cameras of the named views, in scene units."""
         wanted = set(names)
-        return [self.trained.scene.camera(i) for i, view in enumerate(self.capture.views) if view.name in wanted]
+        return [self.scene.camera(i) for i, view in enumerate(self.capture.views) if view.name in wanted]
 
     def restricted(self, names: Collection[str]) -> Capture:
         """Return the capture with only the named views to train on."""
         wanted = set(names)
         return self.capture.excluding_from_training({v.name for v in self.capture.views if v.name not in wanted})
+
+    def require_current(self) -> None:
+        """Raise InputError if the model has been divided anew."""
+        if not self.folders.division.exists() or _digest(self.folders.division) != self.key:
+            raise InputError(f"{self.folder.folder} was divided anew in the meantime; run the same command again.")
 
 
 def open_divided(options: argparse.Namespace, reporter: StoppingReporter) -> Divided:
@@ -97,15 +126,20 @@ def open_divided(options: argparse.Namespace, reporter: StoppingReporter) -> Div
     Raises:
         InputError: as `open_trained`, or it is not divided.
     """
-    folders = CellFolders(Reconstruction(options.folder).cells)
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
+    folders = CellFolders(folder.cells)
     division = read_division(folders.division)
+    key = _digest(folders.division)
+    if not (folders.coarse / CURRENT).exists() or digest_of(folders.coarse) != division.checkpoint:
+        raise InputError(
+            f"{folders.coarse / CURRENT} is missing, damaged or of another division; use `split --restart` to divide "
+            "the model anew."
+        )
     trained = open_trained(options, reporter, folders.coarse)
-    coarse = read_part(folders.coarse)
-    if digest_of(folders.coarse) != division.checkpoint:
-        raise InputError(f"{folders.division} belongs to another model than {folders.coarse}; run `split` again.")
     return Divided(
-        trained, with_corrected_masks(trained), folders, division, _digest(folders.division), coarse,
-        cells_of(division, trained.scene, coarse[0]["anchors.positions"]),
+        folder, with_corrected_masks(trained), trained.scene, trained.progress, trained.training,
+        trained.model.device, folders, division, key,
     )  # fmt: skip
 
 
@@ -126,10 +160,14 @@ def with_corrected_masks(trained: Trained) -> Capture:
 
 def read_part(folder: Path) -> Checkpoint:
     """Return the checkpoint in a folder of cells/; raise InputError if there is none or it is damaged."""
-    tensors, state, warning = require_checkpoint(folder)
+    damaged = InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
+    try:
+        tensors, state, warning = require_checkpoint(folder)
+    except InputError as error:
+        raise damaged from error
     if warning:
         # An older one is not what its record describes.
-        raise InputError(f"{folder / CURRENT} is missing or damaged; train this part again.")
+        raise damaged
     return tensors, state
 
 
@@ -190,4 +228,4 @@ def read_part_record(folder: Path) -> PartRecord | None:
         found = typed(PartRecord, read_json(path))
         return PartRecord(**{**found, "made_of": tuple(found["made_of"])})
     except (KeyError, TypeError) as error:
-        raise InputError(f"{path} is damaged; train this part again with --restart.") from error
+        raise InputError(f"{path} is damaged; run `train-cell` with --restart for this cell.") from error

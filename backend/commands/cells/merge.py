@@ -11,16 +11,17 @@ import numpy as np
 from ...model.checkpoint import save_checkpoint
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
+from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.cells.division import NO_CELL
-from ...training.cells.parts import begin_seams, join_cells, merged
+from ...training.cells.parts import Checkpoint, begin_seams, join_cells, merged, without_anchors
 from ...training.state import load_model
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, memory_for_targets, outdate_results
+from ..folder import READ, memory_for_targets, outdate_results, require_reconstruction
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
@@ -53,45 +54,41 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _TRAIN: ("Training", 60.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    divided = open_divided(options, reporter)
-    folder, device = divided.trained.folder, divided.trained.model.device
-    cells = _finished_cells(divided)
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
     with locked(folder.folder):
+        divided = open_divided(options, reporter)
         require_unchanged(folder, divided.division, divided.folders)
-        reporter.begin(_JOIN, f"Joining {len(cells)} cells")
-        parts = [divided.folders.cell(number) / CHECKPOINT for number in range(len(cells))]
-        of = (divided.key, *map(digest_of, parts))
-        counts = [cell.anchors for cell in cells]
-        joined = join_cells(divided.coarse, divided.division, divided.cell_of, map(read_part, parts), counts)
+        device = divided.device
+        with divided.folders.locked():
+            cells = _finished_cells(divided)
+            reporter.begin(_JOIN, f"Joining {len(cells)} cells")
+            parts = [divided.folders.cell(number) / CHECKPOINT for number in range(len(cells))]
+            counts = [cell.anchors for cell in cells]
+            coarse, cell_of = divided.read_coarse()
+            joined = join_cells(coarse, divided.division, cell_of, map(read_part, parts), counts)
+            of = (divided.key, *map(digest_of, parts))
+        surroundings, shared = int((cell_of == NO_CELL).sum()), without_anchors(coarse)
+        del coarse
         steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
         reporter.expect({KERNELS: ("Preparing", kernel_seconds(device))})
         ensure_kernels(reporter, device)
-        seams = _train_seams(divided, joined, steps, of, options, reporter)
-        spent = [divided.trained.progress, seams]
+        seams = _train_seams(divided, shared, joined, surroundings, steps, of, options, reporter)
+        spent = [divided.progress, seams]
         progress = TrainingProgress(
             step=sum(p.step for p in spent) + sum(cell.steps for cell in cells),
             seconds=sum(p.seconds for p in spent) + sum(cell.seconds for cell in cells),
-            curve=divided.trained.progress.curve,
+            curve=divided.progress.curve,
         )
-        surroundings = int((divided.cell_of == NO_CELL).sum())
-        tensors, state = merged(
-            divided.coarse,
-            divided.division,
-            joined,
-            surroundings,
-            read_part(divided.folders.seams / CHECKPOINT),
-            progress,
-            divided.key,
-        )
+        trained = read_part(divided.folders.seams / CHECKPOINT)
+        tensors, state = merged(shared, divided.division, joined, surroundings, trained, progress, divided.key)
         save_checkpoint(folder.checkpoint, tensors, state)
-        del tensors, joined
+        del tensors, joined, trained
         outdate_results(folder)
-        update_record(
-            folder, training=replace(divided.trained.training, steps=progress.step, minutes=None, preset=None)
-        )
+        update_record(folder, training=replace(divided.training, steps=progress.step, minutes=None, preset=None))
         finish_stage(folder, "merge", seams.seconds)
         model = load_model(folder.checkpoint, device)[0]
-        export_model(model, divided.trained.scene, folder, reporter)
+        export_model(model, divided.scene, folder, reporter)
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(model.anchors), splats=str(folder.splats)
     )
@@ -104,8 +101,8 @@ def _finished_cells(divided: Divided) -> list[PartRecord]:
         record = read_part_record(divided.folders.cell(number))
         if record is None or not record.complete or record.made_of != (divided.key,):
             raise InputError(
-                f"Cell {number} of {divided.trained.folder.folder} is not trained to its end; run "
-                f"`train-cell {divided.trained.folder.folder} --cell {number}` first."
+                f"Cell {number} of {divided.folder.folder} is not trained to its end; run "
+                f"`train-cell {divided.folder.folder} --cell {number}` first."
             )
         found.append(record)
     return found
@@ -113,31 +110,36 @@ def _finished_cells(divided: Divided) -> list[PartRecord]:
 
 def _train_seams(
     divided: Divided,
+    shared: Checkpoint,
     joined: dict[str, np.ndarray],
+    surroundings: int,
     steps: int,
     of: tuple[str, ...],
     options: argparse.Namespace,
     reporter: StoppingReporter,
 ) -> TrainingProgress:
     """Train the joined anchors where cells meet, or go on with that; returns the progress."""
-    folder, device, scene = divided.folders.seams, divided.trained.model.device, divided.trained.scene
+    folder, device, gains = divided.folders.seams, divided.device, divided.scene.gains
     names, memory = divided.division.seam_views, memory_for_targets(options)
     capture = divided.restricted(names)
     make_folder(folder)
     remove_abandoned(folder)
-    record = read_part_record(folder)
     resumed = None
-    if record is not None and record.made_of == of:
-        resumed = Trainer.resume(capture, folder / CHECKPOINT, None, memory, device, scene.gains)
+    try:
+        record = read_part_record(folder)
+        if record is not None and record.made_of == of:
+            resumed = Trainer.resume(capture, folder / CHECKPOINT, None, memory, device, gains)
+    except InputError:
+        reporter.warning(f"{folder} is damaged, so the training where cells meet begins anew.")
     if resumed is not None:
         trainer, warning = resumed
         if warning:
             reporter.warning(warning)
     else:
         shutil.rmtree(folder / CHECKPOINT, ignore_errors=True)
-        surroundings = int((divided.cell_of == NO_CELL).sum())
-        begun = begin_seams(divided.coarse, divided.division, joined, surroundings, divided.cameras(names))
-        trainer = Trainer.restore(capture, *begun, memory, device, scene.gains)
+        begun = begin_seams(shared, divided.division, joined, surroundings, divided.cameras(names))
+        trainer = Trainer.restore(capture, *begun, memory, device, gains)
+        del begun
         write_part_record(folder, PartRecord(of))
     reporter.begin(_TRAIN, f"Training {len(trainer.model.anchors) - trainer.region.fixed:,} anchors where cells meet")
     if capture.train_indices:

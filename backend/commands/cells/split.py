@@ -10,11 +10,12 @@ import numpy as np
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder
 from ...shared.reconstruction.checkpoint import CURRENT
+from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...training.cells.division import Division, divide, read_division, write_division
 from ...training.cells.visibility import first_unseen, shares, with_views
-from ..folder import READ, open_trained
+from ..folder import READ, open_trained, require_reconstruction
 from ..stages import stage
 from .folder import CellFolders, cells_of, digest_of, require_unchanged
 
@@ -24,17 +25,25 @@ _VIEWS = "views"
 def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Write cells/ with the division and a copy of the checkpoint."""
     reporter.expect({READ: ("Preparing", 5.0), _VIEWS: ("Choosing views", 20.0)})
-    trained = open_trained(options, reporter)
-    folders = CellFolders(trained.folder.cells)
-    scene, model, views = trained.scene, trained.model, trained.capture.views
-    with locked(trained.folder.folder), stage(trained.folder, "split"):
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
+    folders = CellFolders(folder.cells)
+    with locked(folder.folder), stage(folder, "split"):
+        trained = open_trained(options, reporter)
+        scene, model, views = trained.scene, trained.model, trained.capture.views
         if folders.division.exists() and not options.restart:
             division = read_division(folders.division)
             _require_same(division, options)
-            require_unchanged(trained.folder, division, folders)
+            require_unchanged(folder, division, folders)
             reporter.status("The model is already divided like that; use --restart to discard its cells.")
             reporter.done(cells=options.cells, folder=str(folders.folder))
             return
+        with folders.locked():
+            pass  # A cell in training is a reason to refuse at once, too.
+        if not trained.is_latest:
+            raise InputError(
+                f"{folder.checkpoint / CURRENT} is missing or damaged; continue the training with `train`."
+            )
         positions = model.anchors.positions.cpu().numpy()
         near = scene.before_surroundings(model.anchors.positions).cpu().numpy()
         if near.sum() < options.cells:
@@ -54,13 +63,14 @@ def split(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         unseen = first_unseen(division.cells)
         if unseen is not None:
             raise InputError(f"No view shows cell {unseen}; use fewer --cells.")
-        # First, so that a stop in between leaves no division without its parts.
-        folders.division.unlink(missing_ok=True)
         if folders.folder.exists():
+            with folders.locked():
+                # First, so that a stop in between leaves no division without its parts, and that no cell is begun.
+                folders.division.unlink(missing_ok=True)
             shutil.rmtree(folders.folder)
         make_folder(folders.coarse)
         with atomic_path(folders.coarse / CURRENT) as part:
-            shutil.copyfile(trained.folder.checkpoint / CURRENT, part)
+            shutil.copyfile(folder.checkpoint / CURRENT, part)
         # Last, since it makes the folder one of cells.
         write_division(
             folders.division, Division(digest_of(folders.coarse), options.overlap, division.cells, division.seam_views)

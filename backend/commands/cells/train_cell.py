@@ -31,18 +31,20 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     seconds = None if options.minutes is None else 60 * options.minutes
     reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _TRAIN: ("Training", seconds or 300.0)})
     divided = open_divided(options, reporter)
-    division, device = divided.division, divided.trained.model.device
+    division, device = divided.division, divided.device
     number = options.cell
     if number >= len(division.cells):
         raise InputError(f"There is no cell {number}: {divided.folders.division} has {len(division.cells)}, from 0 on.")
-    steps = options.steps or (None if seconds else max(divided.trained.progress.step, 1))
+    steps = options.steps or (None if seconds else max(divided.progress.step, 1))
     budget = Budget(steps, seconds, first=FIRST)
     folder = divided.folders.cell(number)
     make_folder(folder)
     with locked(folder):
+        divided.require_current()
         remove_abandoned(folder)
-        record, before = PartRecord((divided.key,)), read_part_record(folder)
-        if options.restart or before is None or before.made_of != record.made_of:
+        record = PartRecord((divided.key,))
+        before = None if options.restart else read_part_record(folder)
+        if before is None or before.made_of != record.made_of:
             write_part_record(folder, record)
             if (folder / CHECKPOINT).exists():
                 shutil.rmtree(folder / CHECKPOINT)
@@ -71,18 +73,21 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: StoppingReporter) -> Trainer:
     """Return the trainer of a cell, resumed if it was begun before."""
-    cell, scene = divided.division.cells[number], divided.trained.scene
+    cell = divided.division.cells[number]
     capture, checkpoint = divided.restricted(cell.views), divided.folders.cell(number) / CHECKPOINT
-    memory, device = memory_for_targets(options), divided.trained.model.device
+    memory, device, gains = memory_for_targets(options), divided.device, divided.scene.gains
     if has_checkpoint(checkpoint):
-        resumed = Trainer.resume(capture, checkpoint, None, memory, device, scene.gains)
+        resumed = Trainer.resume(capture, checkpoint, None, memory, device, gains)
         assert resumed is not None
         trainer, warning = resumed
         if warning:
             reporter.warning(warning)
+            # Even if nothing is left to train, the damaged one is replaced.
+            trainer.save(checkpoint)
         return trainer
-    tensors, state = begin_cell(divided.coarse, divided.division, number, divided.cell_of, divided.cameras(cell.views))
-    return Trainer.restore(capture, tensors, state, memory, device, scene.gains)
+    coarse, cell_of = divided.read_coarse()
+    tensors, state = begin_cell(coarse, divided.division, number, cell_of, divided.cameras(cell.views))
+    return Trainer.restore(capture, tensors, state, memory, device, gains)
 
 
 def _trained(trainer: Trainer) -> int:

@@ -44,6 +44,18 @@ def anchors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
     return found
 
 
+def for_parts(coarse: Checkpoint) -> Checkpoint:
+    """Return the checkpoint of a coarse model without what parts are not made of, which takes most of the memory."""
+    tensors, state = coarse
+    kept = {name: value for name, value in tensors.items() if not name.startswith(("adam.", "growth.", "mean.rows"))}
+    return {**kept, **{f"anchors.{name}": value for name, value in anchors_of(coarse).items()}}, state
+
+
+def without_anchors(coarse: Checkpoint) -> Checkpoint:
+    """Return what the parts of a model share, for `begin_seams` and `merged`."""
+    return {name: value for name, value in coarse[0].items() if not name.startswith("anchors.")}, coarse[1]
+
+
 def begin_part(
     shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, cameras: Iterable[Camera],
     seed: Sequence[int],
@@ -51,7 +63,7 @@ def begin_part(
     """Return the checkpoint from which a part of a model is trained.
 
     Args:
-        shared: checkpoint of the coarse model.
+        shared: checkpoint of the coarse model, of whose anchors nothing is used.
         anchors: anchors of the whole model, as from `anchors_of`.
         trained: (N,) bool, those of the part.
         bounds: where anchors may be added.
@@ -133,7 +145,7 @@ def begin_seams(
     """Return the checkpoint from which the seams of joined cells are trained; no anchors are added.
 
     Args:
-        shared: checkpoint of the coarse model.
+        shared: checkpoint of the coarse model, of whose anchors nothing is used.
         division: the cells.
         anchors: the joined anchors, from `join_cells`.
         surroundings: number of the first of them that belong to no cell.
