@@ -162,13 +162,16 @@ def require_reconstruction(folder: Reconstruction) -> None:
         )
 
 
-def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Path | None = None) -> Trained:
+def open_trained(
+    options: argparse.Namespace, reporter: Reporter, checkpoint: Path | None = None, own: Path | None = None
+) -> Trained:
     """Open a trained reconstruction with its capture.
 
     Args:
         options: Options with the folder, and the device to load the model on; `capture` replaces a recorded folder.
         reporter: Receives status and warnings.
         checkpoint: Folder of the checkpoint; None: that of the reconstruction.
+        own: The only folder that may be written to, as several processes use the reconstruction; None: all of it.
 
     Returns:
         The reconstruction, with the capture edited and planned as for its training.
@@ -196,13 +199,16 @@ def open_trained(options: argparse.Namespace, reporter: Reporter, checkpoint: Pa
         raise InputError(f"The capture {source} of {folder.folder} does not exist; specify its folder with --capture.")
     # The capture of the training; record.capture changes with a later import of another capture.
     max_size = training.votes.max_size
-    capture = load_capture(source, folder.cache, memory_for_files(options), max_size, reporter)
+    # Another place of the photos, which this machine alone may have, makes what is cached of them obsolete.
+    is_elsewhere = record.capture is None or str(source.resolve()) != record.capture.folder
+    cache = own / folder.cache.name if own is not None and is_elsewhere else folder.cache
+    capture = load_capture(source, cache, memory_for_files(options), max_size, reporter)
     if digest(capture) != training.votes.capture:
         raise InputError(
             f"The capture {source} is not the one that {folder.folder} was trained on; put that one back, give "
             "its location with --capture, or train again."
         )
-    if options.capture:
+    if options.capture and own is None:
         agreement = recorded_agreement(folder, capture, max_size)
         update_record(folder, capture=capture_record(capture, max_size, agreement))
         write_capture_cameras(folder, capture)

@@ -387,7 +387,8 @@ def test_folders_in_use_are_neither_read_nor_deleted(divided, run_command, monke
             assert_rejected(run_command(*words), "in use")
 
 
-def test_coarse_model_is_not_kept_while_cells_are_trained(divided, run_command, monkeypatch):
+def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tmp_path, run_command, monkeypatch):
+    shutil.move(shutil.copytree(divided_once[0], tmp_path / "copy"), tmp_path / "moved")
     coarse = []
 
     def watch(name):
@@ -411,11 +412,18 @@ def test_coarse_model_is_not_kept_while_cells_are_trained(divided, run_command, 
     watch("open_trained")
     watch("read_part")
     monkeypatch.setattr(Trainer, "run", run)
-    train = ("train-cell", divided, "--cell", 0, "--steps", 3)
+    before = contents_of(divided)
+    train = ("train-cell", divided, "--cell", 0, "--steps", 3, "--capture", tmp_path / "moved")
     assert run_command(*train).code == EXIT_DONE
+    assert {name: value for name, value in contents_of(divided).items() if not name.startswith("cells/0")} == before
     coarse.clear()
     assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
     assert run_command("merge", divided).code == EXIT_DONE and not coarse
+
+
+def contents_of(place):
+    """Return the contents of all files in a folder by their names."""
+    return {path.relative_to(place).as_posix(): path.read_bytes() for path in place.rglob("*") if path.is_file()}
 
 
 @pytest.mark.long

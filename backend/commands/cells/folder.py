@@ -116,27 +116,30 @@ class Divided:
             raise InputError(f"{self.folder.folder} was divided anew in the meantime; run the same command again.")
 
 
-def open_divided(options: argparse.Namespace, reporter: StoppingReporter) -> Divided:
+def open_divided(options: argparse.Namespace, reporter: StoppingReporter, cell: int | None = None) -> Divided:
     """Open a reconstruction that `split` has divided.
 
     Args:
         options: as for `open_trained`.
         reporter: receives status and warnings.
+        cell: a cell that is to be trained by this process, which then writes to the folder of the cell alone.
 
     Raises:
-        InputError: as `open_trained`, or it is not divided.
+        InputError: as `open_trained`, or it is not divided, or has no such cell.
     """
     folder = Reconstruction(options.folder)
     require_reconstruction(folder)
     folders = CellFolders(folder.cells)
     division = read_division(folders.division)
     key = _digest(folders.division)
+    if cell is not None and cell >= len(division.cells):
+        raise InputError(f"There is no cell {cell}: {folders.division} has {len(division.cells)}, from 0 on.")
     if not (folders.coarse / CURRENT).exists() or digest_of(folders.coarse) != division.checkpoint:
         raise InputError(
             f"{folders.coarse / CURRENT} is missing, damaged or of another division; use `split --restart` to divide "
             "the model anew."
         )
-    trained = open_trained(options, reporter, folders.coarse)
+    trained = open_trained(options, reporter, folders.coarse, None if cell is None else folders.cell(cell))
     return Divided(
         folder, with_corrected_masks(trained), trained.scene, trained.progress, trained.training,
         trained.model.device, folders, division, key,

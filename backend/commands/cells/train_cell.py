@@ -7,7 +7,6 @@ import shutil
 from dataclasses import replace
 
 from ...model.checkpoint import has_checkpoint
-from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
@@ -30,11 +29,9 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Train a cell in its own folder; nothing else is written, so that others may train other cells."""
     seconds = None if options.minutes is None else 60 * options.minutes
     reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _TRAIN: ("Training", seconds or 300.0)})
-    divided = open_divided(options, reporter)
-    division, device = divided.division, divided.device
     number = options.cell
-    if number >= len(division.cells):
-        raise InputError(f"There is no cell {number}: {divided.folders.division} has {len(division.cells)}, from 0 on.")
+    divided = open_divided(options, reporter, number)
+    division, device = divided.division, divided.device
     steps = options.steps or (None if seconds else max(divided.progress.step, 1))
     budget = Budget(steps, seconds, first=FIRST)
     folder = divided.folders.cell(number)
