@@ -183,6 +183,10 @@ def _add_cells(commands: _Commands) -> None:
         "--steps", type=types.count, metavar="N",
         help="total number of training steps of the cell (default: as many as the divided model has)",
     )  # fmt: skip
+    cell.add_argument(
+        "--max-anchors", type=types.count, metavar="N",
+        help="maximum number of anchors of the cell (default: as for the whole of the divided model)",
+    )  # fmt: skip
     cell.add_argument("--restart", action="store_true", help="discard an earlier training of the cell")
     options.add_checkpoint_seconds(cell)
     merge = commands.add_for_result("merge", "Join the trained cells", texts.MERGE, "town-splats")

@@ -99,7 +99,8 @@ capture, and write only to the folder of their cell.
 
 TRAIN_CELL = """\
 Train one cell of a divided model further. What its photos show around it stays as it
-is. After a stop, run the same command again to go on.
+is. It may have as many anchors as the whole model before, unless --max-anchors says
+otherwise, and so more detail. After a stop, run the same command again to go on.
 """
 
 MERGE = """\

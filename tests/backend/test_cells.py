@@ -16,6 +16,7 @@ import torch
 
 from backend.commands.cells import folder as opening
 from backend.commands.cells import split
+from backend.commands.training import memory
 from backend.model.checkpoint import CURRENT, load_checkpoint, save_checkpoint
 from backend.raster import devices
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
@@ -412,10 +413,15 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
     watch("open_trained")
     watch("read_part")
     monkeypatch.setattr(Trainer, "run", run)
+    monkeypatch.setattr(memory, "free_memory", lambda: 1e6)
     before = contents_of(divided)
     train = ("train-cell", divided, "--cell", 0, "--steps", 3, "--capture", tmp_path / "moved")
-    assert run_command(*train).code == EXIT_DONE
+    result = run_command(*train, "--max-anchors", 4321, "--json")
+    assert result.code == EXIT_DONE and any("4,321 anchors" in message for message in result.messages("warning"))
     assert {name: value for name, value in contents_of(divided).items() if not name.startswith("cells/0")} == before
+    state = read_checkpoint(divided / "cells" / "0" / "checkpoint")[1]
+    assert state["settings"]["max_anchors"] == 4321
+    assert_rejected(run_command(*train, "--max-anchors", 5), "4321", "--restart")
     coarse.clear()
     assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
     assert run_command("merge", divided).code == EXIT_DONE and not coarse

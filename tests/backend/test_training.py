@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from backend.commands.training.memory import warn_of_memory
+from backend.commands.setup import machine
+from backend.commands.training import memory
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
 from backend.model.draw import draw
@@ -27,6 +28,7 @@ from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StopRequest
 from backend.training.budget import Budget
+from backend.training.cells.region import EVERYWHERE, Region
 from backend.training.extent import pixel_size
 from backend.training.initial_model import initial_model
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
@@ -637,11 +639,11 @@ def test_capture_without_masks_trains_as_one_class(tiny):
 
 def test_targets_are_held_in_a_quarter_of_their_size(tiny, monkeypatch):
     capture, _ = tiny()
-    memory = 4 * sum(view.width * view.height for view in capture.views) / 1e6
+    megabytes = 4 * sum(view.width * view.height for view in capture.views) / 1e6
     gains = np.linspace(0.5, 2.0, 3 * len(capture)).reshape(-1, 3)
     classes = ClassTable(capture.object_ids)
     normalization = Normalization.of(capture.points.xyz, capture.points.xyz)
-    scene = Scene(capture, classes, normalization, memory_mb=memory, gains=gains)
+    scene = Scene(capture, classes, normalization, memory_mb=megabytes, gains=gains)
     read, image_of = [], capture.image
     monkeypatch.setattr(capture, "image", lambda *key: read.append(key) or image_of(*key))
     for index in (*range(len(capture)), *range(len(capture))):
@@ -752,19 +754,37 @@ def test_paper_mode_has_no_residuals(tiny, tmp_path):
 def test_training_that_may_take_more_memory_than_is_free_says_what_fits(tiny, monkeypatch):
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, Settings(offsets=4, max_anchors=3_000_000))
-    warnings = []
+    free, warnings = 1 << 44, []
     reporter = SimpleNamespace(warning=warnings.append)
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=1 << 44))
-    warn_of_memory(trainer, 2000, reporter)
+    monkeypatch.setattr(memory, "free_memory", lambda: free)
+    memory.warn_of_memory(trainer, 2000, reporter)
     assert not warnings
-    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8e9))
-    warn_of_memory(trainer, 2000, reporter)
-    (sentence,) = warnings
-    fits = int(sentence.split("--max-anchors ")[1].split()[0])
-    assert "3,000,000 anchors" in sentence and 0 < fits < 3_000_000
+    free = 8e9
+    memory.warn_of_memory(trainer, 2000, reporter)
+    fits = int(warnings[0].split("--max-anchors ")[1].split()[0])
+    assert "3,000,000 anchors" in warnings[0] and 0 < fits < 3_000_000
     roomy = Trainer.start(capture, ids, Settings(offsets=4, max_anchors=fits))
-    warn_of_memory(roomy, 2000, reporter)
+    memory.warn_of_memory(roomy, 2000, reporter)
     assert len(warnings) == 1, "what is said to fit does"
+    trainer.progress.step = 5
+    memory.warn_of_memory(trainer, 2000, reporter)
+    assert f"--restart with --max-anchors {fits}" in warnings[1], "a training goes on with the same settings"
+    trainer.region = Region(10, EVERYWHERE)
+    memory.warn_of_memory(trainer, 2000, reporter)
+    assert "more --cells" in warnings[2]
+    free = 2e9
+    memory.warn_of_memory(trainer, 2000, reporter)
+    assert "close other programs" in warnings[3] and "--max-anchors" not in warnings[3]
+
+
+def test_free_memory_is_limited_by_control_groups(tmp_path, monkeypatch):
+    monkeypatch.setattr(machine, "CGROUPS", tmp_path)
+    for limit in (None, "max\n"):
+        if limit is not None:
+            (tmp_path / "memory.max").write_text(limit)
+        assert machine.free_memory() > 1e8
+    (tmp_path / "memory.max").write_text("1000000\n")
+    assert machine.free_memory() == 1e6
 
 
 def test_training_begins_with_no_more_anchors_than_allowed(tiny):

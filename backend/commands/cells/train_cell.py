@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 
 from ...model.checkpoint import has_checkpoint
+from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
@@ -17,6 +18,7 @@ from ...training.trainer import Trainer
 from ..folder import READ, memory_for_targets
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
+from ..training.memory import warn_of_memory
 from .folder import CHECKPOINT, Divided, PartRecord, open_divided, read_part_record, write_part_record
 
 FIRST = 0.1
@@ -53,6 +55,7 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             )
         else:
             write_part_record(folder, record)
+            warn_of_memory(trainer, options.memory_mb, reporter)
             reporter.expect({KERNELS: ("Preparing", kernel_seconds(device))})
             ensure_kernels(reporter, device)
             reporter.begin(_TRAIN, f"Training {_trained(trainer):,} anchors of cell {number}")
@@ -70,13 +73,18 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: StoppingReporter) -> Trainer:
     """Return the trainer of a cell, resumed if it was begun before."""
-    cell = divided.division.cells[number]
+    cell, most = divided.division.cells[number], options.max_anchors
     capture, checkpoint = divided.restricted(cell.views), divided.folders.cell(number) / CHECKPOINT
     memory, device, gains = memory_for_targets(options), divided.device, divided.scene.gains
     if has_checkpoint(checkpoint):
         resumed = Trainer.resume(capture, checkpoint, None, memory, device, gains)
         assert resumed is not None
         trainer, warning = resumed
+        if most not in (None, trainer.settings.max_anchors):
+            raise InputError(
+                f"Cell {number} was begun with --max-anchors {trainer.settings.max_anchors}; use the same, or "
+                "--restart to start over."
+            )
         if warning:
             reporter.warning(warning)
             # Even if nothing is left to train, the damaged one is replaced.
@@ -84,6 +92,8 @@ def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: 
         return trainer
     coarse, cell_of = divided.read_coarse()
     tensors, state = begin_cell(coarse, divided.division, number, cell_of, divided.cameras(cell.views))
+    if most is not None:
+        state["settings"] = {**state["settings"], "max_anchors": most}
     return Trainer.restore(capture, tensors, state, memory, device, gains)
 
 

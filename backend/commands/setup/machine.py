@@ -6,6 +6,8 @@ import importlib.metadata
 import os
 import platform
 import sys
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -16,6 +18,9 @@ from ...raster import devices
 from ...shared.version import __version__
 
 _PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
+
+CGROUPS = Path("/sys/fs/cgroup")
+"""Where Linux tells the limits of containers and of jobs on clusters."""
 
 
 def set_threads(threads: int | None) -> None:
@@ -49,6 +54,21 @@ def machine_facts(device: torch.device) -> dict[str, Any]:
         **gpu,
         **{name: importlib.metadata.version(name) for name in _PACKAGES},
     }
+
+
+def free_memory() -> float:
+    """Return the bytes that this process may have: what it has, what is free, and no more than its control groups."""
+    free = psutil.virtual_memory().available + psutil.Process().memory_info().rss
+    own = "/"
+    with suppress(OSError):
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+        own = next((line[3:] for line in lines if line.startswith("0::")), own)
+    here = CGROUPS / own.lstrip("/")
+    for folder in (here, *here.parents):
+        # It has no number without a limit, and no such file outside of control groups.
+        with suppress(OSError, ValueError):
+            free = min(free, int((folder / "memory.max").read_text()))
+    return float(free)
 
 
 def peak_mb() -> float:

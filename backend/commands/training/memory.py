@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import psutil
-
 from ...model.anchors import Layout
 from ...model.object_model import anchors_in_view
 from ...shared.events import Reporter
 from ...training.step import frustum
 from ...training.trainer import Trainer
+from ..setup.machine import free_memory
 
 _BASE = 0.7e9
 """Bytes of a training without a model: packages, kernels, and one view at a time."""
@@ -36,24 +35,34 @@ def bytes_per_anchor(layout: Layout, in_view: float) -> float:
 
 
 def warn_of_memory(trainer: Trainer, memory_mb: float, reporter: Reporter) -> None:
-    """Warn if a training on the CPU may take more memory than is free.
+    """Warn if a training on the CPU may take more memory than is free, and say what helps.
 
     Args:
-        trainer: at its start.
+        trainer: of a model or of a cell, before its first step or resumed.
         memory_mb: the limit for decoded images.
         reporter: receives the warning.
     """
-    anchors, capture = trainer.model.anchors, trainer.scene.capture
+    anchors, capture, fixed = trainer.model.anchors, trainer.scene.capture, trainer.region.fixed
     if trainer.model.device.type != "cpu" or not len(anchors):
         return
     views = capture.train_indices[:: -(-len(capture.train_indices) // _VIEWS)]
     counts = [len(anchors_in_view(anchors, *frustum(trainer.scene.camera(index)))) for index in views]
     each = bytes_per_anchor(anchors.layout, max(counts) / len(anchors))
-    most, rest = max(trainer.settings.max_anchors, len(anchors)), _BASE + memory_mb * 1e6
-    free = psutil.virtual_memory().available + psutil.Process().memory_info().rss
-    if rest + most * each > free:
-        fits = max(int((free - rest) / each) // _ROUNDING, 1) * _ROUNDING
-        reporter.warning(
-            f"With {most:,} anchors, this training may take {(rest + most * each) / 1e9:.0f} GB of memory, and "
-            f"{free / 1e9:.0f} GB are free; --max-anchors {fits} fits, and `split` divides larger models into cells."
-        )
+    trained, rest = len(anchors) - fixed, _BASE + memory_mb * 1e6 + fixed * each
+    most, free = max(trainer.settings.max_anchors, trained), free_memory()
+    if rest + most * each <= free:
+        return
+    fits = int((free - rest) / each) // _ROUNDING * _ROUNDING
+    of_cell = not trainer.region.is_whole
+    # Those with which a cell begins are not thinned out.
+    if fits < (max(trained, _ROUNDING) if of_cell else _ROUNDING):
+        advice = "close other programs or lower --memory-mb"
+    else:
+        advice = f"{'--restart with ' if trainer.progress.step else ''}--max-anchors {fits} fits"
+    otherwise = (
+        "`split` with more --cells makes smaller ones" if of_cell else "`split` divides larger models into cells"
+    )
+    reporter.warning(
+        f"With {most:,} anchors, this training may take {(rest + most * each) / 1e9:.0f} GB of memory, and "
+        f"{free / 1e9:.0f} GB are free; {advice}, and {otherwise}."
+    )
