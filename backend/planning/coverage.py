@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -30,6 +32,9 @@ _MOST_VIEWS = 150
 
 _FEW_POINTS = 2000
 """Number of points, spread evenly, that are looked for first."""
+
+_TOGETHER = 8192
+"""Largest number of points near each other whose views are found together."""
 
 _CELLS = 40
 """Number of cells along the longer side of a view in which points are counted."""
@@ -211,11 +216,13 @@ def unseen_points(capture: Capture) -> np.ndarray:
     # Points that COLMAP observed need no projection, which leaves few.
     for index in capture.train_indices:
         unseen[capture.observed(index)] = False
-    for index in capture.train_indices:
-        left = np.flatnonzero(unseen)
-        if not len(left):
-            break
-        unseen[left[_inside(capture, index, capture.points.xyz[left])]] = False
+    for left, views in _with_views(capture, np.flatnonzero(unseen)):
+        for index in views:
+            if not len(left):
+                break
+            seen = _inside(capture, index, capture.points.xyz[left])
+            unseen[left[seen]] = False
+            left = left[~seen]
     return unseen if not unseen.all() else np.zeros_like(unseen)
 
 
@@ -251,3 +258,38 @@ def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:
         v = y / z * view.K[1, 1] + view.K[1, 2]
         inside = (u >= -across) & (u <= view.width + across) & (v >= -down) & (v <= view.height + down)
     return (z > 0) & inside
+
+
+def _with_views(capture: Capture, points: np.ndarray) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Yield the points, by their indices, in groups of neighbors, with the training views that may show any of them.
+
+    Those are left out of which one border has the group's bounding box on its outer side.
+    """
+    views, xyz = capture.train_indices, capture.points.xyz[points]
+    if not len(points) or not views:
+        return
+    borders = [_borders(capture.views[index]) for index in views]
+    normals, offsets = np.array([each[0] for each in borders]), np.array([each[1] for each in borders])
+    # More than rounding changes.
+    slack = 1e-6 * (np.abs(offsets).max() + np.abs(xyz).max())
+    order = cKDTree(xyz, _TOGETHER, compact_nodes=False, balanced_tree=False).indices
+    for first in range(0, len(order), _TOGETHER):
+        group = order[first : first + _TOGETHER]
+        low, high = xyz[group].min(0), xyz[group].max(0)
+        farthest = normals @ ((low + high) / 2) + offsets + np.abs(normals) @ ((high - low) / 2)
+        yield points[group], [index for index, far in zip(views, farthest, strict=True) if (far > -slack).all()]
+
+
+def _borders(view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return the planes around what `_inside` finds inside a view: unit normals (5, 3), and offsets (5,).
+
+    A point is on the inner side of a plane if normal . point + offset is positive.
+    """
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    across, down = MARGIN * view.width, MARGIN * view.height
+    normals = np.array(
+        [[fx, 0, cx + across], [-fx, 0, view.width + across - cx], [0, fy, cy + down],
+         [0, -fy, view.height + down - cy], [0, 0, 1.0]]
+    )  # fmt: skip
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals @ view.viewmat[:3, :3], normals @ view.viewmat[:3, 3]

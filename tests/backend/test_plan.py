@@ -13,7 +13,7 @@ from PIL import Image
 from backend.capture import load_capture
 from backend.labels import read_points
 from backend.model.checkpoint import load_checkpoint
-from backend.planning import decisions
+from backend.planning import coverage, decisions
 from backend.planning.coverage import blind_views, duplicate_views, unseen_points, vacancy, views_like_held_out
 from backend.planning.decisions import (
     DECISIONS,
@@ -211,6 +211,25 @@ def test_blind_views_and_unseen_points_are_found(write_capture, tmp_path):
 
     nothing = capture.excluding_from_training(set(scene.names) - {"view_003.png"})
     assert blind_views(nothing) == [] and not unseen_points(nothing).any(), "at least one view and point remain"
+
+
+def test_unseen_points_are_those_outside_of_each_view(write_capture, tmp_path, monkeypatch):
+    """Points are looked for in groups, which are left out for most views that show none of them."""
+    scene = write_capture(views=9, size=(64, 48))
+    scene.seen = [np.zeros(0, int) for _ in scene.seen]
+    scene.pixels = [np.zeros((0, 2)) for _ in scene.pixels]
+    scene.xyz = np.random.default_rng(0).normal(size=(3000, 3)) * 8
+    scene.rgb = np.zeros((3000, 3), np.uint8)
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    capture = loaded(scene, tmp_path)
+    expected = np.ones(len(capture.points.xyz), bool)
+    for index in capture.train_indices:
+        expected &= ~coverage._inside(capture, index, capture.points.xyz)
+    tests, original = [], coverage._inside
+    monkeypatch.setattr(coverage, "_TOGETHER", 20)
+    monkeypatch.setattr(coverage, "_inside", lambda *inputs: tests.append(len(inputs[2])) or original(*inputs))
+    assert np.array_equal(unseen_points(capture), expected) and 0.1 < expected.mean() < 0.9
+    assert sum(tests) < 0.7 * len(expected) * len(capture.train_indices)
 
 
 def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):
