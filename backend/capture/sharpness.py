@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
+from ..shared.stopping import Check, proceed
 from .capture import Capture
 
 BLURRED = 0.5
@@ -32,7 +33,7 @@ _ROUNDS = 6
 """Number of alternating medians over views and points."""
 
 
-def measure_contrasts(capture: Capture, views: Sequence[int]) -> np.ndarray:
+def measure_contrasts(capture: Capture, views: Sequence[int], check: Check = proceed) -> np.ndarray:
     """Return the contrast of each view's fine details relative to those of the other views.
 
     A point looks alike in all views, so the energy of the image's derivatives around it is modeled as a product of
@@ -42,6 +43,7 @@ def measure_contrasts(capture: Capture, views: Sequence[int]) -> np.ndarray:
     Args:
         capture: The capture; must be prepared.
         views: Indices of the views to compare.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         (len(views),) float64, ratios of gradients, 1 for the median view; 1 where too few points can be compared.
@@ -51,7 +53,7 @@ def measure_contrasts(capture: Capture, views: Sequence[int]) -> np.ndarray:
     """
     if not len(views):
         return np.ones(0)
-    owner, point, size, energy = _observe(capture, views)
+    owner, point, size, energy = _observe(capture, views, check)
     seen_in = np.bincount(point, minlength=len(capture.points.xyz))
     compared = seen_in[point] >= _FEWEST_VIEWS
     owner, size, energy = owner[compared], size[compared], energy[compared]
@@ -63,13 +65,16 @@ def measure_contrasts(capture: Capture, views: Sequence[int]) -> np.ndarray:
     return np.where(counts >= _FEWEST_POINTS, np.exp(factors.min(0) / 2), 1.0)
 
 
-def _observe(capture: Capture, views: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _observe(
+    capture: Capture, views: Sequence[int], check: Check
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return where views show points: place in `views`, point, log size, and log energy in four directions (n, 4)."""
     xyz = capture.points.xyz
     # The same points in all views: those that come first in one order of all.
     order = np.random.default_rng(0).permutation(len(xyz))
     found = []
     for place, index in enumerate(views):
+        check()
         view = capture.views[index]
         observed = np.unique(capture.observed(index))
         observed = observed[np.argsort(order[observed])]

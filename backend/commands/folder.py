@@ -216,7 +216,13 @@ def open_trained(
     plan = plan_of(training)
     capture = planned_capture(edited(capture, folder, training.left_out), plan)
     exposure = plan["exposure"]
-    gains = None if exposure is None else measure_gains(capture) if exposure.done else np.ones((len(capture), 3))
+    gains = (
+        None
+        if exposure is None
+        else measure_gains(capture, reporter.check)
+        if exposure.done
+        else np.ones((len(capture), 3))
+    )
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
         capture, model.classes, model.normalization, zero_is_object, memory_for_targets(options),

@@ -21,10 +21,11 @@ _CLEARLY = 0.8
 """Margin from which on a point without an object counts as background: 9 of 10 masks leave it unlabeled."""
 
 
-def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int) -> Plan:
+def write_default_plan(folder: Reconstruction, capture: Capture, max_size: int, reporter: Reporter) -> Plan:
     """Write plan.json for a training with the default settings, from the facts known so far, and return it."""
     objects, _ = find_requested_objects(folder, capture)
-    context = build_context(capture, Choices(max_size=max_size), objects, voted_points(folder, capture))
+    points, wanted = voted_points(folder, capture), Choices(max_size=max_size)
+    context = build_context(capture, wanted, objects, reporter, points)
     plan = decide(context)
     write_plan(folder.plan, plan)
     return plan
@@ -34,6 +35,7 @@ def build_context(
     capture: Capture,
     requested: Choices,
     objects: list[SceneObject],
+    reporter: Reporter,
     points: LabeledPoints | None = None,
     thorough: bool = False,
     resumed: Plan | None = None,
@@ -43,6 +45,7 @@ def build_context(
     Args:
         capture: The capture, unedited.
         requested, objects, thorough, resumed: As in `PlanningContext`.
+        reporter: Ends the planning if the user wants to stop.
         points: The result of a vote on the capture's points; None before.
 
     Returns:
@@ -51,11 +54,13 @@ def build_context(
     left_out = [entry.id for entry in objects if entry.left_out]
     capture = capture.edited({entry.id: entry.name for entry in objects}, left_out)
     if points is None:
-        return PlanningContext(capture, requested, objects, thorough=thorough, resumed=resumed)
+        return PlanningContext(capture, requested, objects, thorough=thorough, resumed=resumed, check=reporter.check)
     ids = capture.without_left_out(points.ids)
     # Points at the borders of objects, which some masks show on them, are not evidence of a background.
     in_background = (ids == 0) & ((points.margins >= _CLEARLY) | (points.ids != 0))
-    return PlanningContext(capture, requested, objects, ids, in_background, thorough, resumed=resumed)
+    return PlanningContext(
+        capture, requested, objects, ids, in_background, thorough, resumed=resumed, check=reporter.check
+    )
 
 
 def choices(options: argparse.Namespace) -> Choices:

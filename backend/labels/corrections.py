@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ..capture import Capture
+from ..shared.stopping import Check, proceed
 from .voting import find_observed_points
 
 IGNORED = -1
@@ -74,7 +75,9 @@ class Region(NamedTuple):
         return np.where((agreeing >= _AGREEING) & (middle > 0), middle, IGNORED)
 
 
-def correct_masks(capture: Capture, point_ids: np.ndarray, ignore_gaps: bool) -> tuple[Capture, int]:
+def correct_masks(
+    capture: Capture, point_ids: np.ndarray, ignore_gaps: bool, check: Check = proceed
+) -> tuple[Capture, int]:
     """Correct the masks of training views where they contradict the votes.
 
     Args:
@@ -82,15 +85,16 @@ def correct_masks(capture: Capture, point_ids: np.ndarray, ignore_gaps: bool) ->
         point_ids: (M,) int64, the objects of the capture's points by the votes of all objects.
         ignore_gaps: whether unlabeled pixels where objects should be are ignored, since other unlabeled pixels are
             supervised to show no object.
+        check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         The capture whose `mask` returns the corrected IDs of training views, IGNORED where none is known, and the
         number of regions that are corrected. Held-out and validation views are unchanged.
     """
-    wrong = {
-        index: [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
-        for index in capture.train_indices
-    }
+    wrong = {}
+    for index in capture.train_indices:
+        check()
+        wrong[index] = [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
     shown_in = Counter(object_id for index in capture.train_indices for object_id in capture.ids_in(index))
     wrong_in = Counter(object_id for ids in wrong.values() for object_id in set(ids))
     kept = {object_id for object_id, views in wrong_in.items() if views > _MOSTLY_WRONG * shown_in[object_id]}

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..capture import Capture
+from ..shared.stopping import Check, proceed
 
 MOST_POINTS = 400
 """Largest number of points for an object."""
@@ -35,19 +36,23 @@ class MaskPoints(NamedTuple):
     ids: np.ndarray
 
 
-def place_points(capture: Capture, object_ids: Sequence[int], seed: int = 0) -> MaskPoints:
+def place_points(capture: Capture, object_ids: Sequence[int], seed: int = 0, check: Check = proceed) -> MaskPoints:
     """Place points of objects where their masks in the training views agree.
 
     Args:
         capture: The capture; must be prepared.
         object_ids: The objects.
         seed: For the choice of pixels and points.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         Up to MOST_POINTS points for each object; none for an object whose masks agree nowhere or that fewer than two
         views show.
     """
-    parts = [_points_of(capture, object_id, np.random.default_rng([seed, object_id])) for object_id in object_ids]
+    parts = []
+    for object_id in object_ids:
+        check()
+        parts.append(_points_of(capture, object_id, np.random.default_rng([seed, object_id])))
     found = [(xyz, rgb, np.full(len(xyz), i, np.int64)) for (xyz, rgb), i in zip(parts, object_ids, strict=True)]
     nothing = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
     return MaskPoints(*(np.concatenate(columns) for columns in zip(nothing, *found, strict=True)))

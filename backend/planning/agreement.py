@@ -10,6 +10,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from ..capture import Capture
+from ..shared.stopping import Check, proceed
 
 _PHOTOS = 16
 """Largest number of photos that are compared with their neighbors."""
@@ -36,7 +37,7 @@ _MOST_POINTS = 20_000
 """Largest number of points of a photo whose depths are used."""
 
 
-def measure_agreement(capture: Capture) -> float | None:
+def measure_agreement(capture: Capture, check: Check = proceed) -> float | None:
     """Return how well photos agree with what their neighbors show at the depths of the capture's points.
 
     Each of some photos is predicted from the training views that see the middle of the scene from the most similar
@@ -45,6 +46,7 @@ def measure_agreement(capture: Capture) -> float | None:
 
     Args:
         capture: The capture; must be prepared.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         The median PSNR of the half of each photo's pixels that agree best, in dB; None if too few can be compared.
@@ -54,7 +56,12 @@ def measure_agreement(capture: Capture) -> float | None:
     """
     views = capture.train_indices
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _PHOTOS)).astype(int))
-    found = [value for place in chosen if (value := _agreement_of(capture, views, int(place))) is not None]
+    found = []
+    for place in chosen:
+        check()
+        value = _agreement_of(capture, views, int(place))
+        if value is not None:
+            found.append(value)
     return float(np.median(found)) if found else None
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..capture import BLURRED, Capture, View, measure_contrasts
+from ..shared.stopping import Check, proceed
 
 SAME_PIXELS = 0.5
 """Two views have the same position if the points of one move by at most this many pixels in the other."""
@@ -40,13 +41,14 @@ _CELLS = 40
 """Number of cells along the longer side of a view in which points are counted."""
 
 
-def duplicate_views(capture: Capture) -> list[int]:
+def duplicate_views(capture: Capture, check: Check = proceed) -> list[int]:
     """Find training views that duplicate an earlier one: same position, same image, same objects in the masks.
 
     Images are read only for views at the same position.
 
     Args:
         capture: The capture; must be prepared.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         Indices of the duplicates, ascending.
@@ -60,6 +62,7 @@ def duplicate_views(capture: Capture) -> list[int]:
     # In the order of the earlier view, so that the first of several equal views is kept. The views near each one are
     # looked up one by one, since all pairs of a fixed camera's thousands of views would not fit into memory.
     for first, a in enumerate(train):
+        check()
         if a not in found:
             near = (second for second in tree.query_ball_point(poses[first], SAME_PIXELS, p=np.inf) if second > first)
             for b in sorted(train[second] for second in near):
@@ -70,13 +73,14 @@ def duplicate_views(capture: Capture) -> list[int]:
     return sorted(found)
 
 
-def views_like_held_out(capture: Capture) -> list[int]:
+def views_like_held_out(capture: Capture, check: Check = proceed) -> list[int]:
     """Find training views that show what a held-out view shows: same position, same camera, same image.
 
     A training on them has seen the held-out image, whatever the masks.
 
     Args:
         capture: The capture; must be prepared.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         Indices of the training views, ascending.
@@ -89,6 +93,7 @@ def views_like_held_out(capture: Capture) -> list[int]:
     found: set[int] = set()
     images = _Images(capture)
     for index, candidates in zip(held_out, near, strict=True):
+        check()
         for i in {train[candidate] for candidate in candidates} - found:
             if _same_camera(capture, i, index) and images.are_same(i, index):
                 found.add(i)
@@ -144,11 +149,12 @@ class _Images:
         return self._means[index]
 
 
-def blind_views(capture: Capture) -> list[int]:
+def blind_views(capture: Capture, check: Check = proceed) -> list[int]:
     """Find training views that contain no point, even with a margin around their border.
 
     Args:
         capture: The capture.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         Indices of the views, ascending; empty if this holds for all views.
@@ -157,24 +163,27 @@ def blind_views(capture: Capture) -> list[int]:
     xyz = capture.points.xyz
     # A view with points nearly always contains one of a few.
     few = xyz[:: max(len(xyz) // _FEW_POINTS, 1)]
-    blind = [
-        i for i in views
-        if not len(capture.observed(i)) and not _inside(capture, i, few).any() and not _inside(capture, i, xyz).any()
-    ]  # fmt: skip
+    blind = []
+    for index in views:
+        check()
+        some = len(capture.observed(index)) or _inside(capture, index, few).any()
+        if not some and not _inside(capture, index, xyz).any():
+            blind.append(index)
     return blind if len(blind) < len(views) else []
 
 
-def blurred_views(capture: Capture) -> dict[int, float]:
+def blurred_views(capture: Capture, check: Check = proceed) -> dict[int, float]:
     """Find training views that are blurred, if other views show almost all of what they show.
 
     Args:
         capture: The capture; must be prepared.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         Indices of the views, the most blurred first, with the contrast of their details relative to other views.
     """
     views = capture.train_indices
-    contrasts = measure_contrasts(capture, views)
+    contrasts = measure_contrasts(capture, views, check)
     seen_in = np.zeros(len(capture.points.xyz), np.int64)
     for index in views:
         seen_in[np.unique(capture.observed(index))] += 1
@@ -203,11 +212,12 @@ def views_without_objects(capture: Capture) -> list[int]:
     return without if len(without) < len(views) else []
 
 
-def unseen_points(capture: Capture) -> np.ndarray:
+def unseen_points(capture: Capture, check: Check = proceed) -> np.ndarray:
     """Find points outside every training view.
 
     Args:
         capture: The capture.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         (M,) bool; all False if this holds for all points.
@@ -218,6 +228,7 @@ def unseen_points(capture: Capture) -> np.ndarray:
         unseen[capture.observed(index)] = False
     for left, views in _with_views(capture, np.flatnonzero(unseen)):
         for index in views:
+            check()
             if not len(left):
                 break
             seen = _inside(capture, index, capture.points.xyz[left])
@@ -226,15 +237,19 @@ def unseen_points(capture: Capture) -> np.ndarray:
     return unseen if not unseen.all() else np.zeros_like(unseen)
 
 
-def vacancy(capture: Capture) -> float:
+def vacancy(capture: Capture, check: Check = proceed) -> float:
     """Return the mean fraction of the training views' area without points, of at most `_MOST_VIEWS` of them.
 
     Args:
         capture: The capture.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
     """
     xyz, views = capture.points.xyz, capture.train_indices
     some = views[:: -(-len(views) // _MOST_VIEWS) or 1]
-    fractions = [1.0 - occupied_cells(capture.views[index], xyz).mean() for index in some]
+    fractions = []
+    for index in some:
+        check()
+        fractions.append(1.0 - occupied_cells(capture.views[index], xyz).mean())
     return float(np.mean(fractions)) if fractions else 0.0
 
 

@@ -15,6 +15,7 @@ from ..capture import BLURRED, Capture
 from ..shared.defaults import MAX_SIZE
 from ..shared.reconstruction.objects import SceneObject, default_name, merged
 from ..shared.reconstruction.plan import KEYS, Decision, Plan
+from ..shared.stopping import Check, proceed
 from ..training.budget import choose_validation_views
 from ..training.exposure.gains import VARIES_FROM, differences, measure_gains
 from ..training.settings import Settings, background_is_masked, downscale_at
@@ -62,7 +63,8 @@ class PlanningContext:
     of the masks. point_ids: (M,) int64, the points' objects; None before a vote. in_background: (M,) bool, the points
     that no mask, or hardly any, shows on an object; None: those without an object. thorough: whether to read all
     photos, however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that
-    is resumed, which keeps the views that it was begun with; None for a new one.
+    is resumed, which keeps the views that it was begun with; None for a new one. check: called at intervals; ends the
+    planning by an exception once the user wants to stop.
     """
 
     capture: Capture
@@ -73,16 +75,17 @@ class PlanningContext:
     thorough: bool = False
     plan: Plan = field(default_factory=Plan)
     resumed: Plan | None = None
+    check: Check = proceed
 
     @cached_property
     def gains(self) -> np.ndarray:
         """The gains of the photos' color channels, (V, 3), measured on the training views."""
-        return measure_gains(planned_capture(self.capture, self.plan))
+        return measure_gains(planned_capture(self.capture, self.plan), self.check)
 
     @cached_property
     def surroundings(self) -> Surroundings:
         """The surroundings without points that the training views show."""
-        return find_surroundings(planned_capture(self.capture, self.plan))
+        return find_surroundings(planned_capture(self.capture, self.plan), self.check)
 
     @property
     def labeled(self) -> bool:
@@ -104,8 +107,10 @@ def decide(context: PlanningContext) -> Plan:
 
     Raises:
         InputError: A decision cannot be overridden.
+        Exception: That of the context's check, if the user has stopped the planning.
     """
     for decision_of in DECISIONS:
+        context.check()
         decision = decision_of(context)
         if decision is not None:
             plan = Plan((*context.plan.decisions, decision))
@@ -192,7 +197,7 @@ def _rest(context: PlanningContext) -> Decision | None:
         return Decision("rest", what, None, "the votes determine how many points have no object")
     # Points outside all views are ignored: no mask votes on them.
     background = context.point_ids == 0 if context.in_background is None else context.in_background
-    background = background[~unseen_points(context.capture)]
+    background = background[~unseen_points(context.capture, context.check)]
     fraction, supervised = float(np.mean(background)), background_is_masked(background)
     surroundings = context.plan["surroundings"]
     if surroundings is not None and surroundings.done and not supervised:
@@ -240,7 +245,7 @@ def _duplicate_views(context: PlanningContext) -> Decision | None:
         return context.resumed.planned("duplicate-views")
     if not capture.prepared:
         return None
-    repeated, flattering = duplicate_views(capture), views_like_held_out(capture)
+    repeated, flattering = duplicate_views(capture, context.check), views_like_held_out(capture, context.check)
     if len({*repeated, *flattering}) == len(capture.train_indices):
         flattering = []  # Nothing would be left to train on.
     repeated = [i for i in repeated if i not in flattering]
@@ -259,7 +264,7 @@ def _duplicate_views(context: PlanningContext) -> Decision | None:
 
 
 def _blind_views(context: PlanningContext) -> Decision | None:
-    found = blind_views(context.capture)
+    found = blind_views(context.capture, context.check)
     if not found:
         return None
     why = f"none of the {len(context.capture.points.xyz):,} points is visible in them: {_listed(context.names(found))}"
@@ -271,7 +276,7 @@ def _blurred_views(context: PlanningContext) -> Decision | None:
         return context.resumed.planned("blurred-views")
     if not _may_read_photos(context):
         return None
-    found = blurred_views(planned_capture(context.capture, context.plan))
+    found = blurred_views(planned_capture(context.capture, context.plan), context.check)
     if not found:
         return None
     names = context.names(list(found))
@@ -310,7 +315,7 @@ def _validation_views(context: PlanningContext) -> Decision | None:
 
 
 def _unseen_points(context: PlanningContext) -> Decision | None:
-    unseen = unseen_points(planned_capture(context.capture, context.plan))
+    unseen = unseen_points(planned_capture(context.capture, context.plan), context.check)
     if not unseen.any():
         return None
     why = f"{unseen.sum():,} of {len(unseen):,} points lie outside every training view"
@@ -324,7 +329,8 @@ def _dense_points(context: PlanningContext) -> Decision | None:
         return context.resumed.planned("dense-points")
     if not _may_read_photos(context):
         return Decision("dense-points", what, None, "it requires reading all photos, which training does first")
-    vacant = max(vacancy(planned_capture(context.capture, context.plan)) - context.surroundings.fraction, 0.0)
+    vacant = vacancy(planned_capture(context.capture, context.plan), context.check)
+    vacant = max(vacant - context.surroundings.fraction, 0.0)
     why = f"{vacant:.0%} of the photos' area, without the sky, has no points; the threshold is {VACANT:.0%}"
     return Decision("dense-points", what, vacant >= VACANT, why)
 

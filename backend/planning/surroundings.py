@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..capture import Capture
+from ..shared.stopping import Check, proceed
 from ..training.extent import SURROUNDINGS, extent_of
 from .coverage import occupied_cells
 
@@ -51,11 +52,12 @@ class Surroundings(NamedTuple):
     uniform: bool
 
 
-def find_surroundings(capture: Capture) -> Surroundings:
+def find_surroundings(capture: Capture, check: Check = proceed) -> Surroundings:
     """Find the directions in which the training views of a capture show surroundings without points.
 
     Args:
         capture: the capture; must be prepared.
+        check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         The surroundings; xyz is empty if no direction shows any.
@@ -70,6 +72,7 @@ def find_surroundings(capture: Capture) -> Surroundings:
     total = np.zeros((len(directions), 3))
     shown = []
     for index in views:
+        check()
         view, free = capture.views[index], _vacant_cells(capture, index)
         seen, x, y = view.pixels_of(directions @ view.viewmat[:3, :3].T)
         here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]

@@ -40,6 +40,9 @@ class Reporter:
 
     def progress(self, done: float, total: float, **fields: Any) -> None: ...
 
+    def check(self) -> None:
+        """Raise Cancelled if the user wants to stop; for work that has no progress to report."""
+
     def preview(self, path: Path, **fields: Any) -> None: ...
 
     def quality(self, **figures: Any) -> None: ...

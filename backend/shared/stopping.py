@@ -18,8 +18,15 @@ from .errors import Cancelled
 from .events import Reporter
 from .signals import STOPPING
 
+Check = Callable[[], None]
+"""What long work calls at intervals: it raises an exception if the work is to end, such as `Reporter.check`."""
+
 _ASKED_EVERY = 0.1
 """Polling interval in seconds while paused."""
+
+
+def proceed() -> None:
+    """Check nothing, for work that nobody stops."""
 
 
 class StopRequest:
@@ -117,7 +124,8 @@ def _own_stdin() -> Iterable[str]:
 
 
 class StoppingReporter(Reporter):
-    """Forwards events; each progress event waits while `stop` is paused, and raises Cancelled once a stop is requested.
+    """Forwards events; each progress event, and each check, waits while `stop` is paused, and raises Cancelled once a
+    stop is requested.
 
     For work that only writes complete files and may therefore end between any two steps. Other work calls `stop` itself
     and reports to `reporter`, the wrapped reporter.
@@ -138,6 +146,9 @@ class StoppingReporter(Reporter):
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
         self.reporter.progress(done, total, **fields)
+        self.check()
+
+    def check(self) -> None:
         if self.stop():
             raise Cancelled("Stopped; finished results are kept. Run the same command again to continue.")
 

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from backend.capture import load_capture
-from backend.labels import read_points
+from backend.capture import load_capture, sharpness
+from backend.labels import corrections, read_points
+from backend.labels.mask_points import place_points
 from backend.model.checkpoint import load_checkpoint
-from backend.planning import coverage, decisions
+from backend.planning import agreement, coverage, decisions, surroundings
 from backend.planning.coverage import blind_views, duplicate_views, unseen_points, vacancy, views_like_held_out
 from backend.planning.decisions import (
     DECISIONS,
@@ -23,10 +25,11 @@ from backend.planning.decisions import (
     planned_capture,
     planned_settings,
 )
-from backend.shared.errors import EXIT_DONE, InputError
+from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.shared.grouping import changed, chosen, grouped, read_groups
 from backend.shared.reconstruction.objects import edit_objects, merged, read_objects
 from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, write_plan
+from backend.training.exposure import gains
 from backend.training.settings import Settings, downscale_at
 from backend.training.step import ViewStep
 from backend.training.trainer import Trainer
@@ -230,6 +233,43 @@ def test_unseen_points_are_those_outside_of_each_view(write_capture, tmp_path, m
     monkeypatch.setattr(coverage, "_inside", lambda *inputs: tests.append(len(inputs[2])) or original(*inputs))
     assert np.array_equal(unseen_points(capture), expected) and 0.1 < expected.mean() < 0.9
     assert sum(tests) < 0.7 * len(expected) * len(capture.train_indices)
+
+
+def test_planning_stops_when_it_is_asked_to(write_capture, tmp_path, run_command, monkeypatch):
+    scene = write_capture(views=9, size=(64, 48))
+    scene.xyz = np.concatenate([scene.xyz, [[0.0, 500.0, 0.0]]])
+    scene.rgb = np.concatenate([scene.rgb, np.zeros((1, 3), np.uint8)])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    steps = (
+        (surroundings, "_vacant_cells"), (sharpness, "_energies"), (coverage, "occupied_cells"),
+        (gains, "_observations"), (corrections, "_regions"), (coverage, "_inside"), (agreement, "_agreement_of"),
+    )  # fmt: skip
+    for module, name in steps:
+        calls, original = [], getattr(module, name)
+
+        def stop(*inputs, calls=calls, original=original):
+            if not calls:
+                signal.raise_signal(signal.SIGINT)
+            calls.append(inputs)
+            return original(*inputs)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, stop)
+            result = run_command("train", scene.folder, "--out", tmp_path / "out", "--steps", 1, *SMALL)
+        assert result.code == EXIT_CANCELLED and len(calls) == 1, (name, len(calls), result)
+
+    def cancel():
+        raise Cancelled("Stopped.")
+
+    capture = loaded(scene, tmp_path)
+    for work in (
+        duplicate_views,
+        views_like_held_out,
+        blind_views,
+        lambda *inputs: place_points(inputs[0], [1], 0, cancel),
+    ):
+        with pytest.raises(Cancelled):
+            work(capture, cancel)
 
 
 def test_unseen_points_do_not_affect_scene(write_capture, tmp_path):
@@ -442,7 +482,7 @@ def test_begun_training_keeps_its_views(write_capture, tmp_path, run_command, mo
     write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
     train = ("train", scene.folder, "--out", out, *SMALL, "--steps")
     with monkeypatch.context() as earlier:
-        earlier.setattr(decisions, "views_like_held_out", lambda capture: [])
+        earlier.setattr(decisions, "views_like_held_out", lambda *_: [])
         assert run_command(*train, 2).code == EXIT_DONE
     assert read_plan(out / "plan.json").views_left_out == {"view_004.png"}
     assert run_command(*train, 3).code == EXIT_DONE

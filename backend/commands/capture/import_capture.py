@@ -39,8 +39,8 @@ def import_capture(options: argparse.Namespace, reporter: StoppingReporter) -> N
             write_points(folder.points, capture.points, none)
             if folder.objects.exists():
                 write_objects(folder.objects, [])
-        plan = write_default_plan(folder, capture, options.max_size)
-        agreement = measure_agreement(planned_capture(capture, plan))
+        plan = write_default_plan(folder, capture, options.max_size, reporter)
+        agreement = measure_agreement(planned_capture(capture, plan), reporter.check)
         update_record(folder, capture=capture_record(capture, options.max_size, agreement))
     reporter.done(
         cameras=str(folder.cameras), points=str(folder.points), views=len(capture.views), masks=capture.has_masks

@@ -32,8 +32,10 @@ def plan(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.begin("plan", "Planning the training")
         objects, _ = find_requested_objects(folder, capture, options)
         points = voted_points(folder, capture) if folder is not None else None
-        found = decide(build_context(capture, choices(options), objects, points))
-        agreement = measure_agreement(planned_capture(capture, found)) if capture.prepared else None
+        found = decide(build_context(capture, choices(options), objects, reporter, points))
+        agreement = None
+        if capture.prepared:
+            agreement = measure_agreement(planned_capture(capture, found), reporter.check)
         if folder is not None:
             write_plan(folder.plan, found)
     for decision in found.decisions:

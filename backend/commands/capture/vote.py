@@ -21,5 +21,5 @@ def vote(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.begin("plan", "Planning the training")
         change_objects(folder, capture, options)
         output.accept()
-        write_default_plan(folder, capture, options.max_size)
+        write_default_plan(folder, capture, options.max_size, reporter)
     reporter.done(points=str(folder.points), objects=str(folder.objects))

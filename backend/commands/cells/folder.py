@@ -141,7 +141,7 @@ def open_divided(options: argparse.Namespace, reporter: StoppingReporter, cell: 
         )
     trained = open_trained(options, reporter, folders.coarse, None if cell is None else folders.cell(cell))
     return Divided(
-        folder, with_corrected_masks(trained), trained.scene, trained.progress, trained.training,
+        folder, with_corrected_masks(trained, reporter), trained.scene, trained.progress, trained.training,
         trained.model.device, folders, division, key,
     )  # fmt: skip
 
@@ -152,13 +152,14 @@ def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndar
     return np.where(near, division.cells_of(positions), NO_CELL)
 
 
-def with_corrected_masks(trained: Trained) -> Capture:
+def with_corrected_masks(trained: Trained, reporter: StoppingReporter) -> Capture:
     """Return the capture of a training with its masks corrected, as the training itself does."""
     if not trained.capture.has_masks:
         return trained.capture
     ids = read_points(trained.folder.points).ids
     scene = trained.scene
-    return correct_masks(trained.capture, ids, ignore_gaps=scene.supervise_background and not scene.zero_is_object)[0]
+    ignore_gaps = scene.supervise_background and not scene.zero_is_object
+    return correct_masks(trained.capture, ids, ignore_gaps, reporter.check)[0]
 
 
 def read_part(folder: Path) -> Checkpoint:

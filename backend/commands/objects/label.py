@@ -146,7 +146,7 @@ def begin_border_training(
     objects, _ = find_requested_objects(folder, capture)
     wanted = Choices(settings, votes.max_size, until_converged=before.preset == "final")
     points = read_points(folder.points)
-    context = build_context(capture, wanted, objects, points, thorough=True, resumed=plan_of(before))
+    context = build_context(capture, wanted, objects, reporter, points, thorough=True, resumed=plan_of(before))
     plan = decide(context).settled_by(plan_of(before))
     planned = planned_capture(context.capture, plan)
     trainer = begin_with_labels(

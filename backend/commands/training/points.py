@@ -12,6 +12,7 @@ from ...labels.mask_points import MaskPoints, place_points
 from ...planning.coverage import unseen_points
 from ...shared.events import Reporter
 from ...shared.reconstruction.plan import Plan
+from ...shared.stopping import StoppingReporter
 from ...stereo.dense_points import MOST_VIEWS, find_dense_points
 from ..votes import object_name
 
@@ -35,7 +36,7 @@ class StartingPoints(NamedTuple):
 
 
 def starting_points(
-    capture: Capture, point_ids: np.ndarray, plan: Plan, seed: int, reporter: Reporter
+    capture: Capture, point_ids: np.ndarray, plan: Plan, seed: int, reporter: StoppingReporter
 ) -> StartingPoints:
     """Choose and complete a capture's points as its plan decides.
 
@@ -49,7 +50,7 @@ def starting_points(
     Raises:
         InputError: a photo or mask cannot be read.
     """
-    seeds = np.ones(len(point_ids), np.bool_) if plan.does("unseen-points") else ~unseen_points(capture)
+    seeds = np.ones(len(point_ids), np.bool_) if plan.does("unseen-points") else ~unseen_points(capture, reporter.check)
     parts = []
     if plan.does("dense-points"):
         dense, seeds = _dense(capture, seeds, reporter)
@@ -62,14 +63,14 @@ def starting_points(
     return StartingPoints(seeds, MaskPoints(*map(np.concatenate, zip(*parts, strict=True))) if parts else None)
 
 
-def _dense(capture: Capture, seeds: np.ndarray, reporter: Reporter) -> tuple[MaskPoints, np.ndarray]:
+def _dense(capture: Capture, seeds: np.ndarray, reporter: StoppingReporter) -> tuple[MaskPoints, np.ndarray]:
     """Return points on surfaces without features, with their objects, and the seeds that do not float."""
     reporter.expect({DENSE: ("Preparing", _SECONDS * min(len(capture.train_indices), MOST_VIEWS))})
     reporter.begin(DENSE, "Finding points on surfaces without features")
     found = find_dense_points(capture, capture.train_indices, reporter.progress)
     ids = np.zeros(len(found.xyz), np.int64)
     if capture.has_masks and len(ids):
-        ids = vote(capture, positions=found.xyz).ids
+        ids = vote(capture, positions=found.xyz, reporter=StoppingReporter(Reporter(), reporter.stop)).ids
     reporter.status(
         f"{len(found.xyz):,} points added on surfaces without features; {int(found.in_front.sum()):,} of the capture's "
         "left out, which float in front of surfaces"
@@ -80,7 +81,7 @@ def _dense(capture: Capture, seeds: np.ndarray, reporter: Reporter) -> tuple[Mas
 
 def _place(capture: Capture, missing: list[int], seed: int, reporter: Reporter) -> MaskPoints:
     """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
-    placed = place_points(capture, missing, seed)
+    placed = place_points(capture, missing, seed, reporter.check)
     for object_id in missing:
         count, named = int((placed.ids == object_id).sum()), object_name(capture, object_id)
         if count:

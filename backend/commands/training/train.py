@@ -82,7 +82,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         else:
             agreement = recorded_agreement(folder, capture, options.max_size)
             if agreement is None:
-                agreement = measure_agreement(trainer.scene.capture)
+                agreement = measure_agreement(trainer.scene.capture, reporter.check)
             update_record(
                 folder,
                 capture=capture_record(capture, options.max_size, agreement),
@@ -145,7 +145,7 @@ def _begin(
     points = read_points(folder.points)
     objects, _ = find_requested_objects(folder, capture, options)
     before = plan_of(read_record(folder).training) if resuming else None
-    context = build_context(capture, choices(options), objects, points, thorough=True, resumed=before)
+    context = build_context(capture, choices(options), objects, reporter, points, thorough=True, resumed=before)
     assert context.point_ids is not None
     plan = decide(context)
     if before is not None:
@@ -154,7 +154,7 @@ def _begin(
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
     if planned.has_masks:
         supervised = plan.does("rest") and not options.unlabeled_is_object
-        planned, regions = correct_masks(planned, points.ids, ignore_gaps=supervised)
+        planned, regions = correct_masks(planned, points.ids, supervised, reporter.check)
         if regions:
             reporter.status(f"{regions} regions of masks contradict those of other views and are corrected")
     memory = memory_for_targets(options)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...shared.stopping import Check, proceed
+
 if TYPE_CHECKING:
     from ...capture import Capture
 
@@ -22,7 +24,7 @@ _MIN_OBSERVATIONS = 30
 _LIMIT = 4.0
 
 
-def measure_gains(capture: Capture) -> np.ndarray:
+def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
     """Estimate the gains of all views from the training views alone.
 
     The gains of held-out views are unknown: nothing of them is used, and the names of photos say nothing of their
@@ -30,6 +32,7 @@ def measure_gains(capture: Capture) -> np.ndarray:
 
     Args:
         capture: A prepared capture with V views, whose points COLMAP observed.
+        check: Called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
         (V, 3) float64 in display space, with a geometric mean of 1 over the training views; 1 for held-out views, and
@@ -39,12 +42,16 @@ def measure_gains(capture: Capture) -> np.ndarray:
         InputError: an image cannot be read.
     """
     gains = np.ones((len(capture.views), 3))
-    observed = {i: _observations(capture, i) for i in capture.train_indices}
+    observed = {}
+    for i in capture.train_indices:
+        check()
+        observed[i] = _observations(capture, i)
     known = [i for i, (points, _) in observed.items() if len(points) >= _MIN_OBSERVATIONS]
     if len(known) < 2:
         return gains
     count = len(capture.points.xyz)
     for _ in range(_ROUNDS):
+        check()
         total, seen = np.zeros((count, 3)), np.zeros(count)
         for i in known:
             points, colors = observed[i]
