@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Splats of mesh carriers as arrays, for drawing and picking.
 
-The arrays are cached by the session UID of the mesh, never by the mesh itself. They are dropped when the mesh changes,
-on undo and redo, and when another file is opened.
+The arrays are cached by the session UID of the mesh, never by the mesh itself. They are dropped when another file is
+opened. When the mesh is updated, and on undo and redo, they are read again, and kept if they are the same as before, so
+that what is made of them need not be made again.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -19,7 +20,7 @@ from .. import scene
 from ..scene import carrier
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SplatArrays:
     """Visible splats of a carrier as float32 arrays in the object's local coordinates.
 
@@ -38,6 +39,11 @@ class SplatArrays:
     opacities: np.ndarray
     harmonics: np.ndarray
     vertices: np.ndarray | None = None
+
+    def is_same(self, other: SplatArrays) -> bool:
+        """Return whether these are the same splats."""
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return all(np.array_equal(own, theirs) for own, theirs in pairs)
 
     @cached_property
     def cloud(self) -> Cloud:
@@ -59,6 +65,8 @@ class Labels:
 
 
 _held: dict[int, SplatArrays] = {}
+_before: dict[int, SplatArrays] = {}
+"""Session UID of a mesh -> its splats before an update, if they have not been read since."""
 _labels: dict[int, Labels] = {}
 """Session UID of a mesh -> the labels of all its splats."""
 _visible_labels: dict[int, tuple[SplatArrays, Labels]] = {}
@@ -74,7 +82,10 @@ def arrays_of(mesh: bpy.types.Mesh) -> SplatArrays | None:
         and not mesh.is_editmode
         and all(name in mesh.attributes for name in ("radiance:base", "scale", "rotation"))
     ):
-        found = _held[mesh.session_uid] = _read(mesh)
+        found, before = _read(mesh), _before.pop(mesh.session_uid, None)
+        if before is not None and found.is_same(before):
+            found = before
+        _held[mesh.session_uid] = found
     return found
 
 
@@ -96,8 +107,9 @@ def selection_changed(mesh: bpy.types.Mesh) -> None:
 
 
 def splats_changed(mesh: bpy.types.Mesh) -> None:
-    """Drop the cached splats and the selection of a mesh."""
-    _held.pop(mesh.session_uid, None)
+    """Read the splats and the selection of a mesh again when they are needed."""
+    if mesh.session_uid in _held:
+        _before[mesh.session_uid] = _held.pop(mesh.session_uid)
     _selected.pop(mesh.session_uid, None)
 
 
@@ -154,6 +166,13 @@ def _read(mesh: bpy.types.Mesh) -> SplatArrays:
 
 def _forget(*_: Any) -> None:
     _held.clear()
+    _before.clear()
+    _selected.clear()
+
+
+def _undone(*_: Any) -> None:
+    _before.update(_held)
+    _held.clear()
     _selected.clear()
 
 
@@ -164,8 +183,8 @@ def _changed(_scene: Any, depsgraph: Any) -> None:
             splats_changed(update.id.original)
 
 
-_forget, _changed = bpy.app.handlers.persistent(_forget), bpy.app.handlers.persistent(_changed)
-_HANDLERS = (("depsgraph_update_post", _changed), ("undo_post", _forget), ("redo_post", _forget), ("load_pre", _forget))
+_forget, _undone, _changed = (bpy.app.handlers.persistent(handler) for handler in (_forget, _undone, _changed))
+_HANDLERS = (("depsgraph_update_post", _changed), ("undo_post", _undone), ("redo_post", _undone), ("load_pre", _forget))
 
 
 def register() -> None:

@@ -60,6 +60,20 @@ def test_splat_arrays_match_file_and_follow_mesh_changes(root):
     assert splat_arrays.arrays_of(obj.data) is None
 
 
+def test_splat_arrays_outlast_updates_that_do_not_change_them(root):
+    undo = next(handler for handler in bpy.app.handlers.undo_post if handler is splat_arrays._undone)
+    mesh = part(root, 2).data
+    arrays = splat_arrays.arrays_of(mesh)
+    for update in (lambda: undo(bpy.context.scene), lambda: splat_arrays.splats_changed(mesh)):
+        update()
+        update()
+        assert splat_arrays.arrays_of(mesh) is arrays
+    mesh.attributes["radiance:base"].data[3].color = (0.0, 0.0, 0.0, 0.25)
+    undo(bpy.context.scene)
+    changed = splat_arrays.arrays_of(mesh)
+    assert changed is not arrays and changed.opacities[3] == 0.25 and not splat_arrays._before
+
+
 def test_hidden_objects_are_not_drawn(root):
     layer = bpy.context.view_layer
     ids = lambda: sorted(scene.object_id_of(obj) for obj in gather.splat_parts(layer))  # noqa: E731
