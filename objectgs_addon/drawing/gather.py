@@ -12,7 +12,7 @@ from mathutils import Matrix
 
 from ...backend.shared.color.palette import to_encoded
 from .. import scene as scenes
-from .renderer import DrawnObject
+from .entries import DrawnObject
 from .splat_arrays import arrays_of, labels_of, selected_of
 
 NO_RECOLOR = np.hstack([np.eye(3), np.zeros((3, 1))])

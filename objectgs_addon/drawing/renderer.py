@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import bpy
@@ -13,43 +12,18 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
+from ...backend.shared.splats.levels import Merged
 from ...backend.shared.splats.picking import View
 from . import shaders
-from .order import back_to_front
-from .splat_arrays import Labels, SplatArrays
+from .entries import DrawnObject, Entries, entries_of
+from .splat_arrays import SplatArrays
 
 LABEL_AMOUNT = 0.75
 """Opacity of the color of a label over a splat's own."""
 
 
-@dataclass(frozen=True)
-class DrawnObject:
-    """An object to draw.
-
-    Attributes:
-        splats: splats in local coordinates.
-        matrix: (4, 4) local to world.
-        recolor: (3, 4) affine map of colors.
-        color: sRGB-encoded RGB that replaces the splats' colors but keeps their brightness, and its opacity.
-        is_selected: outline it in the color of the selection.
-        is_pointed_at: outline it in white.
-        selected: (N,) bool, the splats that are drawn as selected; None if there are none.
-        labels: colors of single splats; None if there are none.
-    """
-
-    splats: SplatArrays
-    matrix: np.ndarray
-    recolor: np.ndarray
-    color: tuple[float, float, float, float]
-    is_selected: bool = False
-    is_pointed_at: bool = False
-    selected: np.ndarray | None = None
-    labels: Labels | None = None
-
-    @property
-    def slots(self) -> int:
-        """Number of rows in the shader's table of objects: one for the object, and one for each color of labels."""
-        return 1 if self.labels is None else 1 + len(self.labels.colors)
+class TooManySplats(Exception):
+    """The textures cannot hold the splats."""
 
 
 class Renderer:
@@ -64,7 +38,9 @@ class Renderer:
         self._nothing = gpu.types.GPUTexture((1, 1), format="R32F", data=_buffer(np.ones(1)))
         self._target: _Target | None = None
         self._pool: _Pool | None = None
-        self._sorted: _Sorted | None = None
+        self._entries: Entries | None = None
+        self._order: gpu.types.GPUTexture | None = None
+        self._count = 0
 
     def draw(self, objs: Sequence[DrawnObject], view: View, projection: np.ndarray, depth: np.ndarray | None) -> bool:
         """Draw into the renderer's offscreen image.
@@ -78,16 +54,23 @@ class Renderer:
 
         Returns:
             False if there is nothing to draw.
+
+        Raises:
+            TooManySplats: the message says how many are too many.
         """
         objs = [obj for obj in objs if len(obj.splats.means)]
         if not objs:
             return False
         if self._pool is None or not self._pool.holds(objs):
-            self._pool, self._sorted = _Pool(objs), None
-        if self._sorted is None or not self._sorted.holds(objs):
-            self._sorted = _Sorted(self._pool, objs)
-        self._sorted.sort(objs, view)
-        if self._sorted.count == 0:
+            self._pool = self._entries = None
+            self._pool = _Pool(objs)
+        if self._entries is None or not self._entries.holds(objs):
+            self._entries = entries_of(objs, self._pool.starts)
+        entries = self._entries.update(objs, view)
+        if entries is not None:
+            self._count = len(entries)
+            self._order = _texture(entries, "RG32F") if self._count else None
+        if self._count == 0:
             return False
         with _KeptState(), self._target_of(view.width, view.height).buffer.bind():
             gpu.state.active_framebuffer_get().clear(color=(0.0, 0.0, 0.0, 0.0))
@@ -147,7 +130,7 @@ class Renderer:
 
     def free(self) -> None:
         """Free GPU memory."""
-        self._target = self._pool = self._sorted = None
+        self._target = self._pool = self._entries = self._order = None
 
     def _target_of(self, width: int, height: int) -> _Target:
         if self._target is None or (self._target.picture.width, self._target.picture.height) != (width, height):
@@ -171,13 +154,13 @@ class Renderer:
         shader.uniform_float("depths", (float(projection[2, 2]), float(projection[2, 3])))
         shader.uniform_int("bands", self._pool.bands)
         shader.uniform_int("hides", int(depth is not None))
-        objects_table = _table(_objects(objs, view), "RGBA32F")
-        shader.uniform_sampler("order", self._sorted.texture)
+        objects_table = _texture(_objects(objs, view), "RGBA32F")
+        shader.uniform_sampler("order", self._order)
         shader.uniform_sampler("splats", self._pool.splats)
         shader.uniform_sampler("harmonics", self._pool.harmonics)
         shader.uniform_sampler("objects", objects_table)
         shader.uniform_sampler("depth", hiding)
-        self._quads[shader].draw_instanced(shader, instance_count=self._sorted.count)
+        self._quads[shader].draw_instanced(shader, instance_count=self._count)
 
 
 class _Target:
@@ -189,95 +172,54 @@ class _Target:
 
 
 class _Pool:
-    """Splats of several meshes, concatenated in textures."""
+    """Splats of several meshes and of their levels of detail, concatenated in textures."""
 
     def __init__(self, objs: Sequence[DrawnObject]) -> None:
-        self._arrays = list({id(obj.splats): obj.splats for obj in objs}.values())
-        starts = np.cumsum([0, *(len(arrays.means) for arrays in self._arrays)])
-        self.starts = {id(arrays): int(start) for arrays, start in zip(self._arrays, starts)}
+        self._arrays = _arrays_of(objs)
+        starts = np.cumsum([0, *(len(arrays.means) for arrays in self._arrays.values())])
+        self.starts = {key: int(start) for key, start in zip(self._arrays, starts)}
         count = int(starts[-1])
-        room = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get() // max(count, 1)
-        most = max(arrays.harmonics.shape[1] for arrays in self._arrays)
-        self.bands = max(bands for bands in (1, 4, 9, 16) if bands == 1 or bands <= min(most, room))
-        splats = np.zeros((count, shaders.SPLAT_TEXELS, 4), np.float32)
-        harmonics = np.zeros((count, self.bands, 4), np.float32)
-        for arrays, start in zip(self._arrays, starts):
+        texels = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get()
+        room = min(texels // shaders.SPLAT_TEXELS, shaders.MOST_SPLATS)
+        if count > room:
+            raise TooManySplats(
+                f"The graphics driver can draw {room:,} splats at once, not {count:,}; hide some objects"
+            )
+        most = max(arrays.harmonics.shape[1] for arrays in self._arrays.values())
+        self.bands = max(bands for bands in (1, 4, 9, 16) if bands == 1 or bands <= min(most, texels // max(count, 1)))
+        table = _table(count * shaders.SPLAT_TEXELS, 4)
+        splats = table[: count * shaders.SPLAT_TEXELS].reshape(count, shaders.SPLAT_TEXELS, 4)
+        for arrays, start in zip(self._arrays.values(), starts):
             own = slice(start, start + len(arrays.means))
             splats[own, 0, :3], splats[own, 0, 3] = arrays.means, arrays.opacities
             splats[own, 1] = arrays.quats
             splats[own, 2, :3] = arrays.scales
+        self.splats = _upload(table, "RGBA32F")
+        del table, splats  # Large scenes need the memory.
+        table = _table(count * self.bands, 4)
+        harmonics = table[: count * self.bands].reshape(count, self.bands, 4)
+        for arrays, start in zip(self._arrays.values(), starts):
             bands = min(arrays.harmonics.shape[1], self.bands)
-            harmonics[own, :bands, :3] = arrays.harmonics[:, :bands]
-        self.splats = _table(splats, "RGBA32F")
-        self.harmonics = _table(harmonics, "RGBA16F")
+            harmonics[start : start + len(arrays.means), :bands, :3] = arrays.harmonics[:, :bands]
+        self.harmonics = _upload(table, "RGBA16F")
 
     def holds(self, objs: Sequence[DrawnObject]) -> bool:
         """Return whether the textures contain the splats of all these objects and not many others."""
-        wanted = {id(obj.splats): obj.splats for obj in objs}
+        wanted = _arrays_of(objs)
         if not all(key in self.starts for key in wanted):
             return False
         used = sum(len(arrays.means) for arrays in wanted.values())
-        return sum(len(arrays.means) for arrays in self._arrays) <= 2 * used + 100_000
+        return sum(len(arrays.means) for arrays in self._arrays.values()) <= 2 * used + 100_000
 
 
-class _Sorted:
-    """Drawing order of splats for one view and one set of object transforms."""
-
-    def __init__(self, pool: _Pool, objs: Sequence[DrawnObject]) -> None:
-        self._splats, self._slots = [obj.splats for obj in objs], [obj.slots for obj in objs]
-        counts = [len(splats.means) for splats in self._splats]
-        self._entries = np.empty((sum(counts), 2), np.float32)
-        self._depths = np.empty(len(self._entries), np.float32)
-        self._parts = []
-        first = slot = 0
-        for splats, count, slots in zip(self._splats, counts, self._slots):
-            start, own = pool.starts[id(splats)], slice(first, first + count)
-            self._entries[own, 0] = np.arange(start, start + count)
-            self._entries[own, 1] = slot
-            self._parts.append((own, slot))
-            first += count
-            slot += slots
-        self._rows: np.ndarray | None = None
-        self._marked: list[tuple[np.ndarray | None, Labels | None]] = [(None, None)] * len(self._splats)
-        self._order = np.zeros(0, np.int64)
-        self.count = 0
-        self.texture: gpu.types.GPUTexture | None = None
-
-    def holds(self, objs: Sequence[DrawnObject]) -> bool:
-        """Return whether this order is for these objects."""
-        return self._slots == [obj.slots for obj in objs] and all(
-            obj.splats is splats for obj, splats in zip(objs, self._splats)
-        )
-
-    def sort(self, objs: Sequence[DrawnObject], view: View) -> None:
-        """Update the order if the view or an object has moved, and mark selected and labeled splats."""
-        rows = view.viewmat[2] @ np.array([obj.matrix for obj in objs])
-        moved = self._rows is None or not np.array_equal(rows, self._rows)
-        if not self._mark([(obj.selected, obj.labels) for obj in objs]) and not moved:
-            return
-        if moved:
-            self._rows = rows
-            self._sort(rows, view)
-        self.texture = _table(self._entries.take(self._order, axis=0), "RG32F") if self.count else None
-
-    def _mark(self, marked: list[tuple[np.ndarray | None, Labels | None]]) -> bool:
-        """Write which splats are selected, and their labels, into the entries; return False if nothing has changed."""
-        if all(now is before for pair in zip(marked, self._marked) for now, before in zip(*pair)):
-            return False
-        for (own, slot), (selected, labels) in zip(self._parts, marked):
-            self._entries[own, 1] = slot if labels is None else slot + labels.of_splats
-            if selected is not None:
-                self._entries[own, 1] += shaders.SELECTED * selected
-        self._marked = marked
-        return True
-
-    def _sort(self, rows: np.ndarray, view: View) -> None:
-        """Sort the splats by depth; rows (n, 4): the maps from each object's coordinates to the depth."""
-        for splats, row, (own, _) in zip(self._splats, rows.astype(np.float32), self._parts):
-            np.matmul(splats.means, row[:3], out=self._depths[own])
-            self._depths[own] += row[3]
-        self._order = back_to_front(self._depths, view.near, view.orthographic)
-        self.count = len(self._order)
+def _arrays_of(objs: Iterable[DrawnObject]) -> dict[int, SplatArrays | Merged]:
+    """Return the splats of objects and of their levels of detail by their identity."""
+    found: dict[int, SplatArrays | Merged] = {}
+    for obj in objs:
+        found[id(obj.splats)] = obj.splats
+        if obj.levels is not None:
+            found[id(obj.levels.merged)] = obj.levels.merged
+    return found
 
 
 def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
@@ -306,15 +248,23 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
     return table
 
 
-def _table(values: np.ndarray, kind: str) -> gpu.types.GPUTexture:
+def _texture(values: np.ndarray, kind: str) -> gpu.types.GPUTexture:
     """Store texels (..., channels) in a texture with rows of TABLE_WIDTH."""
-    channels = values.shape[-1]
-    texels = values.size // channels
+    texels = values.reshape(-1, values.shape[-1])
+    table = _table(*texels.shape)
+    table[: len(texels)] = texels
+    return _upload(table, kind)
+
+
+def _table(texels: int, channels: int) -> np.ndarray:
+    """Return zeros (rows * TABLE_WIDTH, channels) for at least one texel."""
     rows = max(1, -(-texels // shaders.TABLE_WIDTH))
-    filled = np.empty((rows * shaders.TABLE_WIDTH, channels), np.float32)
-    filled[:texels] = values.reshape(-1, channels)
-    filled[texels:] = 0.0
-    return gpu.types.GPUTexture((shaders.TABLE_WIDTH, rows), format=kind, data=_buffer(filled))
+    return np.zeros((rows * shaders.TABLE_WIDTH, channels), np.float32)
+
+
+def _upload(table: np.ndarray, kind: str) -> gpu.types.GPUTexture:
+    rows = len(table) // shaders.TABLE_WIDTH
+    return gpu.types.GPUTexture((shaders.TABLE_WIDTH, rows), format=kind, data=_buffer(table))
 
 
 def _buffer(values: np.ndarray) -> gpu.types.Buffer:

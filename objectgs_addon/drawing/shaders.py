@@ -24,6 +24,11 @@ OBJECT_TEXELS = 12
 colors; the color with its opacity; the marks, 1 where the object is selected and where it is pointed at; one unused
 texel."""
 
+INDEX_OFFSET = 1 << 24
+"""Subtracted from the indices of splats in `order`: a float32 holds the integers up to this, also the negative ones."""
+
+MOST_SPLATS = 2 * INDEX_OFFSET
+
 OUTLINE_SAMPLES = 12
 """Number of pixels around one that are searched for an object to outline."""
 
@@ -38,6 +43,7 @@ _CONSTANTS = f"""
 #define TABLE_WIDTH {TABLE_WIDTH}
 #define SPLAT_TEXELS {SPLAT_TEXELS}
 #define OBJECT_TEXELS {OBJECT_TEXELS}
+#define INDEX_OFFSET {INDEX_OFFSET}
 #define ALPHA_MAX {ALPHA_MAX!r}
 #define ALPHA_MIN {ALPHA_MIN!r}
 #define EPS_2D {EPS_2D!r}
@@ -95,7 +101,7 @@ void main() {
     tint = vec4(0.0);
     mark = vec2(0.0);
     vec2 entry = at(order, gl_InstanceID).xy;
-    int splat = int(entry.x + 0.5);
+    int splat = int(entry.x) + INDEX_OFFSET;
     int object = int(entry.y + 0.5) * OBJECT_TEXELS;
     vec4 mean_opacity = at(splats, splat * SPLAT_TEXELS);
     vec4 q = at(splats, splat * SPLAT_TEXELS + 1);

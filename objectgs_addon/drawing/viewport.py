@@ -14,14 +14,19 @@ from ...backend.shared.splats.picking import View
 from ..blender import writing
 from ..scene import is_in_file
 from ..scene.shading.modifiers import show_preview
-from . import gather
-from .renderer import Renderer
+from . import detail, gather
+from .renderer import Renderer, TooManySplats
+
+_WAIT = 0.3
+"""Seconds between looks at whether the levels of detail are built."""
 
 OUTLINE = 1.5
 """Width of outlines in pixels at a UI scale of 1."""
 
 _renderer: Renderer | None = None
 _failure: str | None = None
+_refusal: str | None = None
+"""Why the splats of the viewport drawn last are not shown."""
 _handler = None
 _pointed_at: int | None = None
 """Session UID of the collection that a tool outlines."""
@@ -36,8 +41,8 @@ def renderer() -> Renderer:
 
 
 def failure() -> str | None:
-    """Return why splats cannot be drawn on this computer, or None."""
-    return _failure
+    """Return why splats cannot be drawn, or None."""
+    return _failure or _refusal
 
 
 def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, projection: np.ndarray) -> np.ndarray:
@@ -60,7 +65,7 @@ def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, pro
 
 
 def _draw() -> None:
-    global _failure
+    global _failure, _refusal
     context = bpy.context
     space, region = context.space_data, context.region_data
     properties = context.scene.objectgs
@@ -73,6 +78,7 @@ def _draw() -> None:
         print(f"ObjectGS: {_failure}", flush=True)
         bpy.app.timers.register(_show_previews, first_interval=0.0)  # Data cannot be changed while drawing.
         return
+    _refusal = None
     parts = gather.placed_parts(context.view_layer, space)
     objs = gather.gather(parts, properties.colors, _pointed_at, space.overlay.show_overlays)
     meshes = gather.meshes_of(_pointed_at, context.view_layer, space)
@@ -87,7 +93,14 @@ def _draw() -> None:
         read = target.read_depth(x, y, width, height)
         read.dimensions = width * height
         depth = np.array(read, np.float32).reshape(height, width)
-    is_drawn = renderer().draw(objs, view, projection, depth)
+    objs = detail.with_levels(objs)
+    if detail.is_building() and not bpy.app.timers.is_registered(_redraw_when_built):
+        bpy.app.timers.register(_redraw_when_built, first_interval=_WAIT)
+    try:
+        is_drawn = renderer().draw(objs, view, projection, depth)
+    except TooManySplats as error:
+        _refusal = str(error)
+        return
     if meshes:
         depsgraph = context.evaluated_depsgraph_get()
         shapes = [part.evaluated_get(depsgraph) for part in meshes]
@@ -131,6 +144,13 @@ def redraw(_properties: Any = None, _context: bpy.types.Context = None) -> None:
                 area.tag_redraw()
 
 
+def _redraw_when_built() -> float | None:
+    if detail.is_building():
+        return _WAIT
+    redraw()
+    return None
+
+
 @bpy.app.handlers.persistent
 @writing.allowed
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
@@ -156,6 +176,7 @@ def unregister() -> None:
         for scene in bpy.data.scenes:
             for part in gather.carriers(scene):
                 show_preview(part, True)
+    detail.unregister()
     if _renderer is not None:
         _renderer.free()
         _renderer = None
