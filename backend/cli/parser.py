@@ -343,6 +343,11 @@ def _add_export(commands: _Commands) -> None:
         help="highest degree of spherical harmonics (default: as trained)",
     )
     export.add_argument(
+        "--levels", type=int, choices=(1, 2, 3, 4), default=0,
+        help="also write so many coarser versions, each with about a fourth of the splats of the one before: beside "
+        "all.ply, all-1.ply has a fourth, all-2.ply a sixteenth, and so on",
+    )  # fmt: skip
+    export.add_argument(
         "--no-ids", action="store_true", help="omit object_id from PLY, for programs that cannot read it"
     )
     export.add_argument(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import struct
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from backend.commands.cameras import write_splat_cameras
 from backend.editing import apply_edits, transformed
 from backend.editing.placement import middle_of
-from backend.export import read_splats, write_splat, write_splats, write_spz
+from backend.export import coarser_splats, read_splats, write_splat, write_splats, write_spz
 from backend.model.splats import Splats
 from backend.raster import Camera, rasterize
 from backend.shared.errors import EXIT_DONE, InputError
@@ -231,6 +232,31 @@ def test_export_per_object_writes_one_file_each(run_command, folder, tmp_path):
         "export", folder.folder, "--out", tmp_path / "one", "--per-object", "--objects", "can", "--format", "splat"
     )
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["can.splat"]
+
+
+def test_export_writes_coarser_levels(run_command, folder, tmp_path):
+    write_splats(folder.splats, some_splats(5 * (1024 + 10)))
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", "--levels", "2", "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["files"] == 3
+    versions = [read_splats(tmp_path / name)[0] for name in ("all.ply", "all-1.ply", "all-2.ply")]
+    for object_id in (0, 1, 2, 3, 7):
+        parts = [version.select(version.object_ids == object_id) for version in versions]
+        assert [len(part) for part in parts] == [1024 + 10, 256 + 10, 64 + 10]
+        centers = [part.means.mean(0) for part in parts]
+        np.testing.assert_allclose(centers, [centers[0]] * 3, atol=0.15)
+    assert all((version.opacities > 0.0).all() and (version.opacities < 1.0).all() for version in versions)
+    run_command("export", folder.folder, "--out", tmp_path / "parts", "--per-object", "--levels", "1")
+    assert len(read_splats(tmp_path / "parts" / "can.ply")[0]) == 1024 + 10
+    assert len(read_splats(tmp_path / "parts-1" / "can.ply")[0]) == 256 + 10
+
+
+def test_coarser_splats_far_from_the_origin_keep_their_places():
+    splats, place = some_splats(1280), np.array([4e6, 5e6, 100.0])
+    far = replace(splats, means=splats.means.astype(np.float64) + place)
+    (near,), (moved,) = coarser_splats(splats, 1), coarser_splats(far, 1)
+    assert moved.means.dtype == np.float64 and len(moved) == 5 * 64
+    np.testing.assert_allclose(moved.means - place, near.means, atol=1e-4)
+    assert [len(level) for level in coarser_splats(Splats.empty(2), 2)] == [0, 0]
 
 
 def test_blender_coordinates_are_upright(run_command, folder, tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...capture import Upright
 from ...editing import apply_edits, apply_splat_edits, transformed
-from ...export import DOWN_TO_UP, background_sphere, read_splats, write_splat, write_splats, write_spz
+from ...export import DOWN_TO_UP, background_sphere, coarser_splats, read_splats, write_splat, write_splats, write_spz
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
@@ -58,13 +58,22 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if options.bake_background and background:
         splats = concatenate([splats, background_sphere(splats, background)])
     splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")
-    files = _files(options, splats, objects, kind)
+    versions = {options.out: splats}
+    if options.levels:
+        reporter.status("Merging splats")
+        for level, coarser in enumerate(coarser_splats(splats, options.levels), 1):
+            versions[options.out.with_name(f"{options.out.stem}-{level}{options.out.suffix}")] = coarser
+    files = {
+        path: (version, ids)
+        for out, version in versions.items()
+        for path, ids in _files(out, options.per_object, splats, objects, kind).items()
+    }
     for path in files:
         folder.require_foreign(path)
     reporter.begin("write", f"Writing {len(files)} file{'' if len(files) == 1 else 's'}")
-    for done, (path, ids) in enumerate(files.items(), 1):
+    for done, (path, (version, ids)) in enumerate(files.items(), 1):
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = splats if ids is None else splats.select(np.isin(splats.object_ids, ids))
+        part = version if ids is None else version.select(np.isin(version.object_ids, ids))
         for sentence in write(path, part):
             reporter.warning(sentence)
         reporter.progress(done, len(files), what="files")
@@ -108,15 +117,15 @@ def _in_coordinates(splats: Splats, coordinates: str, upright: Upright, y_up: bo
 
 
 def _files(
-    options: argparse.Namespace, splats: Splats, objects: list[SceneObject], kind: str
+    out: Path, per_object: bool, splats: Splats, objects: list[SceneObject], kind: str
 ) -> dict[Path, list[int] | None]:
     """Return path -> IDs of the splats in this file, None: all."""
-    if not options.per_object:
-        if options.out.is_dir():
-            raise InputError(f"{options.out} is a folder; name a file, such as {options.out / f'splats.{kind}'}.")
-        return {options.out: None}
-    if options.out.exists() and not options.out.is_dir():
-        raise InputError(f"{options.out} is a file; with --per-object, name a folder.")
+    if not per_object:
+        if out.is_dir():
+            raise InputError(f"{out} is a folder; name a file, such as {out / f'splats.{kind}'}.")
+        return {out: None}
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file; with --per-object, name a folder.")
     known = {entry.id: entry.name for entry in objects}
     names = {i: known.get(i, default_name(i).lower()) for i in np.unique(splats.object_ids).tolist()}
-    return {options.out / f"{stem}.{kind}": [i] for i, stem in distinct_stems(names).items()}
+    return {out / f"{stem}.{kind}": [i] for i, stem in distinct_stems(names).items()}
