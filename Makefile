@@ -99,14 +99,15 @@ zip: .venv-bpy/ready
 
 test: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WORKERS) -m "not long and not slow" tests/backend
-	$(BLENDER) -m pytest $(WORKERS) -m "not long" tests/blender
+	$(BLENDER) -m pytest $(WORKERS) -m "not long and not slow" tests/blender
 
 test-long: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WORKERS) -m "long and not slow" tests/backend tests/fuzz
-	$(BLENDER) -m pytest $(WORKERS) -m long tests/blender
+	$(BLENDER) -m pytest $(WORKERS) -m "long and not slow" tests/blender
 
-test-slow: .venv/ready
+test-slow: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WORKERS) -m slow tests/backend
+	$(BLENDER) -m pytest $(WORKERS) -m slow tests/blender
 
 test-window: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WINDOW) tests/window

@@ -206,7 +206,7 @@ def test_package_that_is_not_locked_is_rejected(root):
     assert job.state is State.FAILED and "hash" in job.error and not (root / "environment").exists()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_build_from_another_index_brings_no_other_package(root):
     """Its version names the build, it brings no other package, and the locked packages are checked as always."""
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
@@ -217,7 +217,7 @@ def test_build_from_another_index_brings_no_other_package(root):
     assert "extra" not in json.loads((root / "environment-cpu" / "ready.json").read_text())["packages"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_other_build_is_installed_if_index_is_unreachable(root):
     (root / "requirements" / "locked" / f"{layout.system()}-cpu.txt").unlink()
     job, torch, for_gpus = installed_torch(root, "cpu")
