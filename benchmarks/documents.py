@@ -35,6 +35,7 @@ MADE_FROM_FIGURES = {
     "pointing": "benchmarks.pointing:document",
     "poses": "benchmarks.poses:document",
     "reliability": "tests.fuzz.report:document",
+    "scale": "benchmarks.scale:document",
     "stability": "benchmarks.stability:document",
     "suite": "benchmarks.suite:document",
 }

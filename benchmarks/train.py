@@ -64,8 +64,8 @@ def trainer_of(folder: Path, splats: int) -> Trainer:
     keep = min(1.0, splats / max(trainer.splats, 1))
     chosen = np.sort(np.random.default_rng(0).permutation(len(anchors))[: round(keep * len(anchors))])
     anchors.positions, anchors.rows, anchors.ids = anchors.positions[chosen], anchors.rows[chosen], anchors.ids[chosen]
-    trainer.row_optimizer.take(torch.from_numpy(chosen), 0)
-    trainer._average.take(torch.from_numpy(chosen), anchors.rows[:0])
+    trainer.optimizer.rows.take(torch.from_numpy(chosen), 0)
+    trainer.optimizer.average.take(torch.from_numpy(chosen), anchors.rows[:0])
     for done in range(60):
         trainer.step(0.7 + 0.001 * done)
     return trainer

@@ -21,6 +21,7 @@ from ..shared.errors import (
     Cancelled,
     InputError,
     MissingPackage,
+    ProcessLost,
     describe_missing_package,
 )
 from ..shared.events import JsonReporter, Reporter, StagedReporter
@@ -111,6 +112,9 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
     except (Cancelled, KeyboardInterrupt) as error:
         _tell(reporter.stopped, str(error) or "Stopped immediately.")
         return EXIT_CANCELLED
+    except ProcessLost as error:
+        _tell(reporter.error, str(error))
+        return EXIT_FAILED
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT_ERRORS:
             raise  # Files are written with their names in the error, so this is a stream.

@@ -86,7 +86,8 @@ TRAIN = """\
 Train the splats. Writes splats.ply, which splat viewers and Blender read, checkpoints
 to resume from, and previews/, which show the progress. If training is stopped, it
 keeps the mean of its latest steps. To train longer, run the command again with more
---minutes or --steps.
+--minutes or --steps. `torchrun --nproc-per-node 4 -m backend train ...` trains with
+four processes or GPUs.
 """
 
 SPLIT = """\

@@ -26,6 +26,10 @@ class Cancelled(Exception):
     """The user stopped the command; all results worth keeping are on disk."""
 
 
+class ProcessLost(Exception):
+    """Another process of the same training has ended; the message says what to do."""
+
+
 def describe_missing_package(error: ModuleNotFoundError) -> str:
     """Return the message for a Python without the backend's packages."""
     return (

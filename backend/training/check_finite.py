@@ -130,6 +130,10 @@ class FiniteCheck:
         """Whether each step is checked before the next step."""
         return self._closely or not self._on_gpu
 
+    @at_once.setter
+    def at_once(self, closely: bool) -> None:
+        self._closely = closely
+
     def watch(self) -> None:
         """Enable immediate checks if updates were skipped since the last call, otherwise disable them on a GPU.
 

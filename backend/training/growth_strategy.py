@@ -23,6 +23,8 @@ class ViewStatistics(NamedTuple):
         opacities: (S,), opacities of the splats.
         drawn: (S,) bool, the splats that overlap the image.
         screen_gradient: (S, 2), gradient of the loss with respect to the splats' centers in pixels.
+        usable: (n,) bool, on the GPU, of an image that is rendered in one part: anchors for which it is False are
+            ignored.
     """
 
     anchors: torch.Tensor
@@ -30,6 +32,22 @@ class ViewStatistics(NamedTuple):
     opacities: torch.Tensor
     drawn: torch.Tensor | np.ndarray
     screen_gradient: torch.Tensor | np.ndarray
+    usable: torch.Tensor | None = None
+
+    @classmethod
+    def of_view(
+        cls, parts: Sequence[ViewStatistics], offsets: int, usable: torch.Tensor | None
+    ) -> ViewStatistics | None:
+        """Return the statistics of an image; None without any of its parts.
+
+        Args:
+            parts: statistics of the parts in which the image was rendered.
+            offsets: number of splats per anchor.
+            usable: as the attribute, for an image in one part.
+        """
+        if len(parts) > 1:
+            return cls.together(parts, offsets)
+        return parts[0]._replace(usable=usable) if parts else None
 
     @classmethod
     def together(cls, parts: Sequence[ViewStatistics], offsets: int) -> ViewStatistics:
@@ -61,26 +79,17 @@ class GrowthStrategy:
         """Return whether statistics are accumulated at this progress, 0 .. 1; this starts before growth."""
         return GROW_FROM / 2 <= progress < GROW_UNTIL
 
-    def observe(
-        self, parts: Sequence[ViewStatistics], offsets: int, width: int, height: int, usable: torch.Tensor | None
-    ) -> None:
+    def observe(self, view: ViewStatistics, offsets: int, size: tuple[int, int]) -> None:
         """Add the statistics of a view.
 
         Args:
-            parts: statistics of the parts in which the image was rendered.
+            view: the statistics.
             offsets: number of splats per anchor.
-            width, height: size of the whole image in pixels.
-            usable: (n,) bool, on the GPU, if the image is rendered in one part: anchors for which it is False are
-                ignored.
+            size: width and height of the whole image in pixels.
         """
-        if not parts:
-            return
-        whole = len(parts) == 1
-        view = parts[0] if whole else ViewStatistics.together(parts, offsets)
         self.statistics.add(
-            view.anchors, offsets, view.source, view.opacities, view.drawn, view.screen_gradient, width, height,
-            usable if whole else None,
-        )  # fmt: skip
+            view.anchors, offsets, view.source, view.opacities, view.drawn, view.screen_gradient, *size, view.usable
+        )
 
     def is_due(self, progress: float, step: int, last_growth: int) -> bool:
         """Return whether growth is due after `step`; last_growth: the step of the latest growth."""

@@ -98,9 +98,9 @@ def watch(p: TrainingProgress, budget: Budget) -> bool:
     return p.dropped > 0
 
 
-def dropout_at(p: TrainingProgress, progress: float) -> Dropout | None:
-    """Return the dropout of the next step, or None."""
-    return Dropout(p.dropped, p.step) if p.dropped and progress < DROPPED_UNTIL else None
+def dropout_at(p: TrainingProgress, progress: float, step: int) -> Dropout | None:
+    """Return the dropout of the step after so many others, or None."""
+    return Dropout(p.dropped, step) if p.dropped and progress < DROPPED_UNTIL else None
 
 
 def _has_fallen(curve: Sequence[dict[str, Any]]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,25 +71,30 @@ class _Part(NamedTuple):
 
 
 class ViewGradients(NamedTuple):
-    """Loss and gradients of one view; the gradients of the heads are stored in the heads' parameters.
+    """Loss and gradients of one view.
 
     Attributes:
-        camera: camera of the view.
+        size: width and height of the image in pixels.
         loss: () loss; NaN if it is not finite or no anchor is in view.
         seen: (n,) int64, the anchors in view.
-        rows: (n, columns), copies of their rows, with gradients.
+        rows: (n, columns), gradients of their rows.
+        heads: gradients of the parameters of the heads and of the background, in the order of `HeadAdam`; None for
+            those that the loss does not depend on.
+        colors: (2, 3), gradient of the photo's correction, if it is fitted.
         finite: () bool, on the GPU: whether the loss is finite and any anchor is in view.
         usable: (n,) bool, on the GPU: the rows whose gradients may be used.
-        statistics: statistics of the image or its parts, if growth requires them.
+        statistics: statistics of the image, if growth requires them.
     """
 
-    camera: Camera
+    size: tuple[int, int]
     loss: torch.Tensor
     seen: torch.Tensor
     rows: torch.Tensor
+    heads: Sequence[torch.Tensor | None]
+    colors: torch.Tensor | None
     finite: torch.Tensor | None
     usable: torch.Tensor | None
-    statistics: list[ViewStatistics]
+    statistics: ViewStatistics | None
 
 
 class _Limits:
@@ -142,7 +147,13 @@ def strips(
 
 
 class ViewStep:
-    """Computes the loss of a view and its gradients, in as many parts as the GPU's memory requires."""
+    """Computes the loss of a view and its gradients, in as many parts as the GPU's memory requires.
+
+    Attributes:
+        parts: number of parts in which an image is rendered.
+        expected_changes: for anchors (n,) int64, the changes of their rows, (n, columns), that are expected before the
+            gradients are applied; None if there are none.
+    """
 
     def __init__(
         self,
@@ -158,6 +169,7 @@ class ViewStep:
         self.settings = settings
         self.model = model
         self.parts = 1
+        self.expected_changes: Callable[[torch.Tensor], torch.Tensor] | None = None
         self._head_optimizer = head_optimizer
         self._growth = growth
         self._check = check
@@ -217,7 +229,7 @@ class ViewStep:
     def compute(
         self, index: int, progress: float, dropout: Dropout | None = None, alone: bool = False
     ) -> ViewGradients | None:
-        """Compute the loss and gradients of a view.
+        """Compute the loss and gradients of a view; the model is not changed.
 
         Args:
             index: index of the view in the capture.
@@ -226,7 +238,8 @@ class ViewStep:
             alone: also render the objects alone, if this view has a mask that shows the background.
 
         Returns:
-            The loss and gradients; None if no anchor is in view or the loss is not finite.
+            The loss and gradients; None if no anchor is in view, or if the loss is not finite, whose cause the check
+            has then.
 
         Raises:
             InputError: the GPU's memory is too small for the smallest parts, or the view's image cannot be read.
@@ -274,7 +287,10 @@ class ViewStep:
         if len(seen) == 0:
             return None
         self._head_optimizer.zero_grad()
-        rows = take_rows(anchors.rows, seen).requires_grad_()
+        rows = take_rows(anchors.rows, seen)
+        if self.expected_changes is not None:
+            rows += self.expected_changes(seen)
+        rows.requires_grad_()
         correction = None if self.colors is None else self.colors.of(index).requires_grad_(self._fits_colors)
         losses, splats, statistics = [], [], []
         for part in self._parts_of(camera, image, labels):
@@ -282,7 +298,6 @@ class ViewStep:
             terms, g, drawn = self._terms(part, *chosen, present, correction, progress)
             of_part = self._total(terms, part)
             if self._check.at_once and not math.isfinite(float(of_part.detach())):
-                self._check.skipped += 1
                 named = self._split_image_loss(terms, part, drawn, correction)
                 self._check.fault = check_finite.find_fault_of_loss(named, g, chosen[0], anchors.layout.offsets)
                 return None
@@ -295,8 +310,6 @@ class ViewStep:
                         chosen[0], g.source, g.opacities.detach(), drawn.frame.seen, drawn.frame.screen_gradient
                     )
                 )
-        if self.colors is not None and correction is not None and correction.grad is not None:
-            self.colors.step(index, correction.grad, progress)
         loss, self._splats = sum(losses[1:], start=losses[0]), sum(splats[1:], start=splats[0])
         finite = usable = None
         if present is not None:
@@ -306,7 +319,12 @@ class ViewStep:
         elif on_gpu:
             finite = loss.isfinite()
             usable, loss = finite.repeat(len(seen)), torch.where(finite, loss, math.nan)
-        return ViewGradients(camera, loss, seen, rows, finite, usable, statistics)
+        assert rows.grad is not None
+        return ViewGradients(
+            (camera.width, camera.height), loss, seen, rows.grad, self._head_optimizer.gradients,
+            None if correction is None else correction.grad, finite, usable,
+            ViewStatistics.of_view(statistics, anchors.layout.offsets, usable),
+        )  # fmt: skip
 
     def _parts_of(self, camera: Camera, image: torch.Tensor, labels: torch.Tensor | None) -> Iterator[_Part]:
         """Yield the parts to render; their losses add up to the image's, except for SSIM at the cuts."""

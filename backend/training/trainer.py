@@ -6,9 +6,10 @@ results are read when the training reports or saves.
 
 from __future__ import annotations
 
+import functools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,21 +20,20 @@ import torch
 from ..model.checkpoint import save_checkpoint
 from ..model.object_model import ObjectModel
 from ..raster import devices
-from ..shared.errors import Cancelled, InputError
+from ..shared.errors import Cancelled, InputError, ProcessLost
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
 from ..shared.stopping import StopRequest
 from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
 from .cells.region import Region
-from .check_finite import FiniteCheck
-from .growth_strategy import GrowthStrategy
 from .initial_model import DistantPoints, initial_model
 from .optimizer.average import Average
-from .optimizer.head_adam import HeadAdam
-from .optimizer.row_adam import RowAdam
+from .optimizer.model_optimizer import ModelOptimizer
+from .processes.shared_views import Outcome, SharedViews
+from .processes.team import Order, Processes, Team
 from .scene import Scene
-from .settings import HEAD_RATES, Settings, background_is_masked, rate, row_rates
+from .settings import Settings, background_is_masked
 from .state import (
     model_from_checkpoint,
     read_checkpoint,
@@ -71,22 +71,24 @@ class Trainer:
         self.rng = rng
         self.progress = TrainingProgress()
         self.region = region or Region()
-        self.row_optimizer = RowAdam(model.anchors.rows, self.region.fixed)
+        self.optimizer = ModelOptimizer(model, settings, self.region)
+        self.view_step = ViewStep(
+            scene, settings, model, self.optimizer.heads, self.optimizer.growth, self.optimizer.check,
+            fits_colors=self.region.is_whole,
+        )  # fmt: skip
+        self.work_with(Team())
         self._warnings: list[str] = []
         # Not before the current checkpoint is known to be complete, and one of this training.
         self._keeps_current = False
-        self._average = Average(model, self.region.fixed)
-        whole = self.region.is_whole
-        model.background.requires_grad_(settings.background == "learned" and whole)
-        model.heads.requires_grad_(whole)
-        names = [name for name in HEAD_RATES if name != "background"]
-        heads = {name: list(getattr(model.heads, name).parameters()) for name in names}
-        self._head_optimizer = HeadAdam({**heads, "background": [model.background]})
-        self._check = FiniteCheck(model.device)
-        self._growth = GrowthStrategy(settings, model, self.region)
-        self.view_step = ViewStep(
-            scene, settings, model, self._head_optimizer, self._growth, self._check, fits_colors=whole
-        )
+
+    def work_with(self, team: Team) -> None:
+        """Train together with other processes from now on, each with views of its own.
+
+        Args:
+            team: the processes; the first one calls `run`, the others `follow`.
+        """
+        self._team = team
+        self._shared = SharedViews(team, self.settings.layout.columns, self.optimizer.heads.parameters)
 
     @classmethod
     def start(
@@ -133,7 +135,7 @@ class Trainer:
     @property
     def shown(self) -> ObjectModel:
         """The model to display, evaluate and export: the mean over the latest steps."""
-        return self._average.of(self.model)
+        return self.optimizer.average.of(self.model)
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint with all data that the next step depends on.
@@ -141,10 +143,10 @@ class Trainer:
         Raises:
             InputError: the checkpoint cannot be written; the previous one is kept.
         """
-        model = self.model
-        self.progress.skipped += self._check.take_skipped()
+        model, optimizer = self.model, self.optimizer
+        self.progress.skipped += optimizer.check.take_skipped()
         tensors = training_tensors(
-            model, self.row_optimizer, self._growth.statistics, self._average, self._head_optimizer,
+            model, optimizer.rows, optimizer.growth.statistics, optimizer.average, optimizer.heads,
             self.view_step.colors,
         )  # fmt: skip
         state = training_state(
@@ -208,10 +210,11 @@ class Trainer:
         rng.bit_generator.state = state["rng"]
         region = Region.of(state)
         trainer = cls(scene, settings, model.to(device), rng, region)
-        trainer.row_optimizer.restore(tensors)
-        trainer._growth.statistics = restore_statistics(tensors, device)
-        trainer._head_optimizer.restore(tensors)
-        trainer._average = Average.from_checkpoint(tensors, trainer.model, region.fixed)
+        optimizer = trainer.optimizer
+        optimizer.rows.restore(tensors)
+        optimizer.growth.statistics = restore_statistics(tensors, device)
+        optimizer.heads.restore(tensors)
+        optimizer.average = Average.from_checkpoint(tensors, trainer.model, region.fixed)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
         return trainer
@@ -241,11 +244,12 @@ class Trainer:
             Cancelled: a stop was requested; the training is saved.
             InputError, OSError: an image cannot be read or a file cannot be written; the steps so far are saved if
                 possible.
+            ProcessLost: another process of the training has ended; the steps so far are saved.
         """
         first_step = self.progress.step
         try:
             self._train(budget, checkpoints, reporter, evaluate, stop or StopRequest(), checkpoint_seconds)
-        except (InputError, OSError):
+        except (InputError, OSError, ProcessLost):
             if self.progress.step > first_step:
                 with suppress(InputError, OSError):
                     self.save(checkpoints)
@@ -268,6 +272,7 @@ class Trainer:
         capture = self.scene.capture
         if evaluate is not None and not p.step and not capture.validation_indices:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
+        self._team.tell_state(p.__dict__)
         smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:
@@ -278,6 +283,7 @@ class Trainer:
                     reporter.status(_CONVERGED.format(steps=p.step))
                 if overfitting.watch(p, budget):
                     reporter.status(overfitting.OVERFITS)
+                self._team.tell_state(p.__dict__)
             progress = budget.progress(p)
             if progress >= 1.0:
                 break
@@ -291,6 +297,7 @@ class Trainer:
             if stopped:
                 self.save(checkpoints)
                 raise Cancelled(f"Stopped after {p.step} steps; run the same command again to resume.")
+            self._team.tell(Order.STEP, progress, self.optimizer.check.at_once)
             loss = self.step(progress)
             while self._warnings:
                 reporter.warning(self._warnings.pop(0))
@@ -303,7 +310,7 @@ class Trainer:
                 last_report = now
                 p.seconds = before + now - started
                 self._report(budget, reporter, float(smooth), (now - started) / (p.step - first_step))
-                self._check.watch()
+                self.optimizer.check.watch()
             if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)
                 last_saved = time.monotonic()
@@ -349,43 +356,61 @@ class Trainer:
         return self.view_step.splats
 
     def step(self, progress: float) -> torch.Tensor:
-        """Train on one view: forward, backward and update.
+        """Train on one view, or on one in each process: forward, backward and update.
 
         Args:
             progress: progress of the training, 0 .. 1, which determines learning rates, growth and resolution.
 
         Returns:
-            The loss () float32; NaN if no anchor is in view or the loss is not finite.
+            The loss () float32, the mean over the views; NaN if no anchor is in view or the loss is not finite.
         """
-        p = self.progress
-        if not p.queue:
+        p, team, optimizer = self.progress, self._team, self.optimizer
+        while len(p.queue) < team.size:
             views = [index for index in self.scene.capture.train_indices if index not in p.watched]
-            p.queue = self.rng.permutation(views).tolist()
-        self.view_step.expect(p.queue[::-1], progress)
-        gradients = self.view_step.compute(
-            p.queue[-1], progress, overfitting.dropout_at(p, progress), alone=p.step % ALONE_EVERY == 0
-        )
-        # Remove the view only now, so that it remains the next one if its image cannot be read.
-        index = p.queue.pop()
-        p.step += 1
-        if gradients is None:
-            loss = torch.full((), math.nan, device=self.model.device)
-        else:
-            loss = gradients.loss
-            self._update(gradients, progress)
-            self._average.follow(self.model, p.step)
-        before = len(self.model.anchors)
-        if (fault := self._check.take_fault()) is not None:
-            self._handle(fault, index)
-        if gradients is not None and self._growth.observes(progress) and len(self.model.anchors) == before:
-            self._grow(gradients, progress)
-        return loss
+            p.queue = self.rng.permutation(views).tolist() + p.queue
+        outcomes = self._shared.exchange(*self._compute(progress), len(self.model.anchors))
+        # Remove the views only now, so that they remain the next ones if an image cannot be read.
+        indices = [p.queue.pop() for _ in outcomes]
+        losses, faults = [], []
+        for index, (gradients, fault) in zip(indices, outcomes, strict=True):
+            p.step += 1
+            if gradients is None:
+                optimizer.check.skipped += fault is not None
+            else:
+                losses.append(gradients.loss)
+                if self.view_step.colors is not None and gradients.colors is not None:
+                    self.view_step.colors.step(index, gradients.colors, progress)
+                optimizer.update(gradients, progress, p.step)
+                fault = optimizer.check.take_fault()
+            if fault is not None:
+                self._note(fault, index)
+                faults.append(fault)
+        if not optimizer.remove(faults) and losses and optimizer.growth.observes(progress):
+            self._grow([outcome.gradients for outcome in outcomes if outcome.gradients is not None], progress)
+        if not losses:
+            return torch.full((), math.nan, device=self.model.device)
+        return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
 
-    def _handle(self, fault: check_finite.Fault, index: int) -> None:
-        """Count a fault in the step on view `index`, and remove anchors with non-finite parameters.
+    def _compute(self, progress: float) -> tuple[Outcome, Exception | None]:
+        """Compute the gradients of this process' view; returns them, or the error that prevents it."""
+        p, team = self.progress, self._team
+        step = p.step + team.rank
+        try:
+            if team.rank:
+                self.view_step.expected_changes = functools.partial(
+                    self.optimizer.expected_changes, count=team.rank, progress=progress, step=p.step
+                )
+            self.view_step.expect(p.queue[::-1][team.rank :: team.size], progress)
+            gradients = self.view_step.compute(
+                p.queue[-1 - team.rank], progress, overfitting.dropout_at(p, progress, step),
+                alone=step % ALONE_EVERY == 0,
+            )  # fmt: skip
+        except (InputError, OSError) as error:
+            return Outcome(None, None), error
+        return Outcome(gradients, self.optimizer.check.take_fault() if gradients is None else None), None
 
-        Warns if the fault is the first of its kind.
-        """
+    def _note(self, fault: check_finite.Fault, index: int) -> None:
+        """Count a fault in the step on view `index`, and warn if it is the first of its kind."""
         p, model, capture = self.progress, self.model, self.scene.capture
         if fault.what not in p.faults:
             owner = None
@@ -394,51 +419,32 @@ class Trainer:
                 owner = capture.names.get(object_id, default_name(object_id) if object_id else "no object")
             self._warnings.append(fault.sentence(p.step, capture.views[index].name, owner))
         p.faults[fault.what] = p.faults.get(fault.what, 0) + 1
-        if not len(fault.unrecoverable):
-            return
-        a = model.anchors
-        kept = torch.ones(len(a), dtype=torch.bool, device=model.device)
-        kept[fault.unrecoverable] = False
-        # Those were finite before the training, and are none of its business.
-        kept[: self.region.fixed] = True
-        a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
-        kept = kept[self.region.fixed :]
-        self.row_optimizer.take(kept, 0)
-        self._average.take(kept, a.rows[:0])
-        self._growth.clear(model)
 
-    def _update(self, gradients: ViewGradients, progress: float) -> None:
-        optimizer = self._head_optimizer
-        of_heads = {
-            name: [parameter.grad for parameter in group if parameter.grad is not None]
-            for name, group in optimizer.groups.items()
-        }
-        skipped: int | torch.Tensor = 0
-        if self.region.is_whole:
-            skipped = ~optimizer.step(
-                {name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}, gradients.finite
-            )
-        assert gradients.rows.grad is not None
-        skipped = skipped + self.row_optimizer.step(
-            self.model.anchors.rows, gradients.seen, gradients.rows.grad, row_rates(self.settings, progress),
-            self.progress.step, gradients.usable,
-        )  # fmt: skip
-        self._check.skipped += skipped
-        if self._check.at_once and skipped:
-            self._check.fault = check_finite.find_fault_of_rows(
-                gradients.rows.grad, gradients.rows.detach(), gradients.seen, self.settings.layout
-            ) or check_finite.find_fault_of_heads(of_heads)
+    def _grow(self, views: Sequence[ViewGradients], progress: float) -> None:
+        """Add the statistics of views, and grow and prune anchors if it is time."""
+        p, growth = self.progress, self.optimizer.growth
+        for gradients in views:
+            if gradients.statistics is not None:
+                growth.observe(gradients.statistics, self.settings.offsets, gradients.size)
+        if growth.is_due(progress, p.step, p.last_growth):
+            p.last_growth = p.step
+            self.optimizer.grow(self.rng)
 
-    def _grow(self, gradients: ViewGradients, progress: float) -> None:
-        p, anchors, camera = self.progress, self.model.anchors, gradients.camera
-        self._growth.observe(
-            gradients.statistics, anchors.layout.offsets, camera.width, camera.height, gradients.usable
-        )
-        if not self._growth.is_due(progress, p.step, p.last_growth):
-            return
-        p.last_growth = p.step
-        growth = self._growth.grow(self.model, self.rng)
-        # All fixed anchors are kept.
-        kept = growth.kept[self.region.fixed :] - self.region.fixed
-        self.row_optimizer.take(kept, growth.added)
-        self._average.take(kept, anchors.rows[len(anchors) - growth.added :])
+    def follow(self, team: Processes) -> None:
+        """Train with views of this process as the first one tells, until it tells to end.
+
+        Raises:
+            InputError: an image cannot be read, in any of the processes.
+            ProcessLost: another process has ended.
+        """
+        self.work_with(team)
+        while True:
+            order, progress, closely = team.wait()
+            if order == Order.STATE:
+                self.progress = TrainingProgress(**team.receive())
+            elif order == Order.STEP:
+                self.optimizer.check.at_once = closely
+                self.step(progress)
+                self._warnings.clear()
+            else:
+                return

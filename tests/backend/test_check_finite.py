@@ -108,7 +108,7 @@ def test_unrecoverable_splat_is_reported_and_removed(trainer, monkeypatch, value
     count = len(anchors)
     kept = torch.cat([anchors.positions[:near], anchors.positions[near + 1 :]])
     assert trained.step(0.6).isnan()
-    assert len(anchors) == len(trained.row_optimizer.exp_avg) == count - 1 and torch.equal(anchors.positions, kept)
+    assert len(anchors) == len(trained.optimizer.rows.exp_avg) == count - 1 and torch.equal(anchors.positions, kept)
     assert all(t.isfinite().all() for t in numbers(trained))
     what = "the volume loss" if math.isnan(value) else "the image loss"
     splat = 0 if math.isnan(value) else 2
@@ -148,20 +148,20 @@ def test_nonfinite_gradient_affects_only_its_anchor(trainer, monkeypatch, value)
         monkeypatch.setattr(step, "rasterize", corrupted(step.rasterize, 41, given))
         learned = trained.view_step.compute(index, 0.6)
         monkeypatch.undo()
-        trained._update(learned, 0.6)
+        trained.optimizer.update(learned, 0.6, 1)
         results.append((trained, before))
     (clean, _), (hurt, before) = results
     if value == 1e25:  # finite, so only Adam's step overflows
         assert all(t.isfinite().all() for t in numbers(hurt))
-    fault = hurt._check.fault
-    assert clean._check.fault is None and int(hurt._check.skipped) >= 1
+    fault = hurt.optimizer.check.fault
+    assert clean.optimizer.check.fault is None and int(hurt.optimizer.check.skipped) >= 1
     anchor = int(fault.anchors[0])
     assert len(fault.anchors) == 1 and fault.splat is not None and not len(fault.unrecoverable)
     assert torch.equal(hurt.model.anchors.rows[anchor], before[anchor])
     others = torch.arange(len(before)) != anchor
     assert torch.equal(hurt.model.anchors.rows[others], clean.model.anchors.rows[others])
     assert fault.what.startswith("the gradient of the offsets")
-    hurt._handle(fault, hurt.scene.capture.train_indices[0])
+    hurt._note(fault, hurt.scene.capture.train_indices[0])
     (sentence,) = hurt._warnings
     assert f"because of splat {fault.splat} of anchor {anchor} (" in sentence and sentence.endswith("was skipped.")
 
@@ -182,10 +182,10 @@ def test_heads_learn_from_finite_anchors(trainer, monkeypatch, value):
     monkeypatch.setattr(step, "rasterize", call)
     before = [p.detach().clone() for p in trained.model.heads.parameters()]
     learned = trained.view_step.compute(index, 0.6)
-    trained._update(learned, 0.6)
+    trained.optimizer.update(learned, 0.6, 1)
     assert all(p.isfinite().all() for p in trained.model.heads.parameters())
     assert all(not torch.equal(a, b) for a, b in zip(before, trained.model.heads.parameters(), strict=True))
-    assert int(trained._check.skipped) == 1 and "scales and rotations" in trained._check.fault.what
+    assert int(trained.optimizer.check.skipped) == 1 and "scales and rotations" in trained.optimizer.check.fault.what
 
 
 def test_nonfinite_head_gradient_is_reported(trainer, monkeypatch):

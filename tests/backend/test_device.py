@@ -459,9 +459,9 @@ def test_strips_give_same_gradients(tiny, emulate_gpu):
         learned = trainer.view_step.compute(capture.train_indices[0], 0.09)
         full = torch.zeros_like(trainer.model.anchors.rows)
         usable = learned.usable[:, None]
-        full.index_add_(0, learned.seen, torch.where(usable, learned.rows.grad, 0.0))
-        trainer._grow(learned, 0.09)
-        statistics = trainer._growth.statistics
+        full.index_add_(0, learned.seen, torch.where(usable, learned.rows, 0.0))
+        trainer._grow([learned], 0.09)
+        statistics = trainer.optimizer.growth.statistics
         found.append((learned.loss, full, trainer.model.heads.opacity.weight.grad, statistics))
     for loss, rows, head, statistics in found[1:]:
         close(loss, found[0][0], 1e-5)

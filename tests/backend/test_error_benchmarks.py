@@ -8,7 +8,7 @@ from PIL import Image
 
 from backend.capture import load_capture
 from backend.planning.coverage import blind_views, duplicate_views, unseen_points
-from benchmarks import approximations, mask_noise, plan, plan_captures, raster_variants, training_variants
+from benchmarks import approximations, mask_noise, plan, plan_captures, raster_variants, scale, training_variants
 
 
 def test_better_than_requires_no_worse_figure():
@@ -200,3 +200,14 @@ def test_mask_noise_grows_with_level_and_keeps_truth(kind):
     low, high = wrong(0.1), wrong(0.5)
     assert 0.01 < low < 0.2 and low < high and (kind == "segmenter" or high == pytest.approx(0.5, abs=0.15))
     assert (true == before).all()
+
+
+def test_cost_model_is_found_from_its_costs() -> None:
+    rows = [
+        {"photos": n, "points": n * d, "anchors": 0.9 * n * d, "disk_gb": 0.5 + 1e-4 * n + 2e-6 * 0.9 * n * d}
+        for n in (100, 400, 1600)
+        for d in (100, 400)
+    ]
+    found = scale.fit(rows, "disk_gb")
+    assert found == pytest.approx({"": 0.5, "photos": 1e-4, "anchors": 2e-6})
+    assert scale.predict(found, rows[3]) == pytest.approx(rows[3]["disk_gb"])

@@ -39,8 +39,8 @@ def test_dropout_begins_where_spared_views_become_worse(psnr: list[float | None]
     p = TrainingProgress(step=30, watched=[3, 5], curve=[{"watched_psnr": value} for value in psnr])
     assert watch(p, Budget(steps=100)) is overfits
     assert p.watched == ([] if overfits else [3, 5])
-    dropout = dropout_at(p, 0.4)
-    assert (dropout is not None) is overfits and dropout_at(p, 0.99) is None
+    dropout = dropout_at(p, 0.4, 7)
+    assert (dropout is not None) is overfits and dropout_at(p, 0.99, 7) is None
     assert watch(p, Budget(steps=100)) is False
 
 
@@ -53,7 +53,7 @@ def test_spared_views_join_the_others(budget: Budget, released: int) -> None:
     assert p.watched == [3, 5]
     p.step = released
     watch(p, budget)
-    assert p.watched == [] and dropout_at(p, 0.5) is None
+    assert p.watched == [] and dropout_at(p, 0.5, 7) is None
 
 
 def test_dropout_leaves_out_its_share_of_the_splats() -> None:

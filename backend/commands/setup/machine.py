@@ -6,7 +6,8 @@ import importlib.metadata
 import os
 import platform
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import torch
 
 from ...raster import devices
 from ...shared.version import __version__
+from ...training.processes.team import processes_here
 
 _PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
 
@@ -24,10 +26,21 @@ CGROUPS = Path("/sys/fs/cgroup")
 
 
 def set_threads(threads: int | None) -> None:
-    """Set the number of threads of kernels and torch; None for all cores that this process may use."""
-    count = max(min(threads or cores(), numba.config.NUMBA_NUM_THREADS), 1)
+    """Set the number of threads of kernels and torch; None for this process' share of the cores that it may use."""
+    count = max(min(threads or cores() // processes_here(), numba.config.NUMBA_NUM_THREADS), 1)
     numba.set_num_threads(count)
     torch.set_num_threads(count)
+
+
+@contextmanager
+def threads_of_all_processes() -> Iterator[None]:
+    """Use the threads of all processes that torchrun has started, while the others wait."""
+    own = numba.get_num_threads()
+    set_threads(own * processes_here())
+    try:
+        yield
+    finally:
+        set_threads(own)
 
 
 def cores() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ...model.anchors import Layout
 from ...model.object_model import anchors_in_view
 from ...shared.events import Reporter
+from ...training.processes.team import processes_here
 from ...training.step import frustum
 from ...training.trainer import Trainer
 from ..setup.machine import free_memory
@@ -49,7 +50,7 @@ def warn_of_memory(trainer: Trainer, memory_mb: float, reporter: Reporter) -> No
     counts = [len(anchors_in_view(anchors, *frustum(trainer.scene.camera(index)))) for index in views]
     each = bytes_per_anchor(anchors.layout, max(counts) / len(anchors))
     trained, rest = len(anchors) - fixed, _BASE + memory_mb * 1e6 + fixed * each
-    most, free = max(trainer.settings.max_anchors, trained), free_memory()
+    most, free = max(trainer.settings.max_anchors, trained), free_memory() / processes_here()
     if rest + most * each <= free:
         return
     fits = int((free - rest) / each) // _ROUNDING * _ROUNDING

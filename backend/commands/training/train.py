@@ -6,6 +6,8 @@ import argparse
 import functools
 import statistics
 from collections.abc import Callable
+from contextlib import closing
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +29,7 @@ from ...shared.reconstruction.record import TrainingRecord, read_record, update_
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.initial_model import FEWEST_ANCHORS, DistantPoints, affordable_anchors
+from ...training.processes.team import Order, Team, choose_gpu, connect, is_follower, processes, processes_here
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import (
@@ -44,8 +47,10 @@ from ..planning import build_context, change_objects, choices, find_requested_ob
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
+from ..setup.machine import threads_of_all_processes
 from ..stages import finish_stage
 from ..votes import VOTE, cast_votes, votes_are_current, votes_key
+from .follow import follow
 from .measuring import Measuring
 from .memory import warn_of_memory
 from .points import DENSE, starting_points
@@ -59,7 +64,17 @@ _TIMED_VIEWS = 3
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
+    choose_gpu()
+    options.memory_mb /= processes_here()
+    if is_follower():
+        follow(options)
+        return
     device = choose_device(options.device, reporter)
+    with closing(connect(device)) as team:
+        _train(team, options, device, reporter)
+
+
+def _train(team: Team, options: argparse.Namespace, device: torch.device, reporter: StoppingReporter) -> None:
     budget = budget_of(options)
     reporter.expect(
         {
@@ -103,7 +118,7 @@ def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 reporter.status(expected)
             warn_of_memory(trainer, options.memory_mb, reporter)
             try:
-                _run(trainer, budget, folder, options.checkpoint_seconds, reporter)
+                _run(trainer, team, budget, folder, options.checkpoint_seconds, reporter)
             except Cancelled:
                 # Also export the result of a stopped training if this takes no time.
                 if trainer.model.explicit and progress.step:
@@ -217,7 +232,7 @@ def _affordable(
     for index in views[:: max(len(views) // _TIMED_VIEWS, 1)][:_TIMED_VIEWS]:
         seconds.append(trainer.view_step.measure_seconds(index))
         reporter.progress(len(seconds), _TIMED_VIEWS)
-    steps = budget.seconds / statistics.median(seconds)
+    steps = budget.seconds / statistics.median(seconds) * processes()
     most = affordable_anchors(anchors, steps, len(views))
     if most == anchors:
         return trainer
@@ -265,18 +280,34 @@ def _check_same_plan(folder: Reconstruction, capture: Capture, plan: Plan) -> No
 
 
 def _run(
-    trainer: Trainer, budget: Budget, folder: Reconstruction, checkpoint_seconds: float, reporter: StoppingReporter
+    trainer: Trainer,
+    team: Team,
+    budget: Budget,
+    folder: Reconstruction,
+    checkpoint_seconds: float,
+    reporter: StoppingReporter,
 ) -> None:
     """Run the training, which handles a stop itself, since it writes a checkpoint first."""
     ensure_kernels(reporter, trainer.model.device)
+    if team.size > 1:
+        trainer.save(folder.checkpoint)
+        team.tell(Order.OPEN)
+        trainer.work_with(team)
     folder.previews.mkdir(exist_ok=True)
     step = trainer.progress.step
     begun = f"Resuming after step {step} with" if step else "Training"
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
+    where += f", in {team.size} processes" if team.size > 1 else ""
     reporter.begin("train", f"{begun} {len(trainer.model.anchors):,} anchors{where}")
     measure = Measuring(folder, budget, reporter)
+
+    def evaluate(*state: Any) -> dict[str, Any]:
+        # The other processes wait.
+        with threads_of_all_processes():
+            return measure(*state)
+
     try:
-        trainer.run(budget, folder.checkpoint, reporter.reporter, measure, reporter.stop, checkpoint_seconds)
+        trainer.run(budget, folder.checkpoint, reporter.reporter, evaluate, reporter.stop, checkpoint_seconds)
     except Cancelled:
         finish_stage(folder, "train", trainer.progress.seconds)
         raise

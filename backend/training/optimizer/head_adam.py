@@ -47,6 +47,21 @@ class HeadAdam:
         for parameter in self._parameters:
             parameter.grad = None
 
+    @property
+    def parameters(self) -> Sequence[torch.Tensor]:
+        """The parameters of all groups."""
+        return self._parameters
+
+    @property
+    def gradients(self) -> list[torch.Tensor | None]:
+        """The gradients of the parameters, None for those that have none."""
+        return [parameter.grad for parameter in self._parameters]
+
+    @gradients.setter
+    def gradients(self, gradients: Sequence[torch.Tensor | None]) -> None:
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
+
     @torch.no_grad()
     def step(self, rates: Mapping[str, float], finite: torch.Tensor | None = None) -> torch.Tensor:
         """Update the parameters that have gradients, in place, if all gradients are finite.

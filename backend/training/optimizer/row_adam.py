@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from .adam import BETA1, BETA2, step_rows
+from ...raster import devices
+from .adam import BETA1, BETA2, EPSILON, step_rows
 
 _PREFIX = "adam."
 
@@ -58,6 +59,23 @@ class RowAdam:
             rows[fixed:], self.exp_avg, self.exp_avg_sq, seen, gradients, rates, 1 - BETA1**number, 1 - BETA2**number,
             usable,
         )  # fmt: skip
+
+    def expected_change(self, seen: torch.Tensor, rates: np.ndarray, number: int) -> torch.Tensor:
+        """Return the change of rows that a step is expected to make, by the mean of their gradients so far.
+
+        Args:
+            seen: (n,) int64, indices of the rows, none of which is fixed.
+            rates: (columns,) float32, the learning rates.
+            number: number of steps so far.
+
+        Returns:
+            (n, columns).
+        """
+        if not number:
+            return self.exp_avg.new_zeros((len(seen), self.exp_avg.shape[1]))
+        mean = self.exp_avg[seen] / (1 - BETA1**number)
+        spread = (self.exp_avg_sq[seen] / (1 - BETA2**number)).sqrt_().add_(EPSILON)
+        return mean.div_(spread).mul_(devices.upload(-rates, mean))
 
     def take(self, kept: torch.Tensor, added: int) -> None:
         """Apply a change of the anchors.
