@@ -100,8 +100,10 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
                 # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
                 from ..commands import COMMANDS
                 from ..commands.setup.machine import set_threads
+                from ..training.processes.team import is_follower
 
-                stack.enter_context(stop.listening(read_stdin=options.json))
+                # All processes of a training have the same standard input.
+                stack.enter_context(stop.listening(read_stdin=options.json and not is_follower()))
             set_threads(options.threads)
             COMMANDS[options.command](options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE

@@ -265,14 +265,14 @@ class Trainer:
         checkpoint_seconds: float,
     ) -> None:
         p = self.progress
-        started = last_saved = last_report = time.monotonic()
         before = p.seconds
         first_step = p.step
         budget.begin(p)
         capture = self.scene.capture
         if evaluate is not None and not p.step and not capture.validation_indices:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
-        self._team.tell_state(p.__dict__)
+        self._team.tell_state(p.__dict__)  # Returns when the others are ready.
+        started = last_saved = last_report = time.monotonic()
         smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import bpy
@@ -61,6 +62,8 @@ class Renderer:
         objs = [obj for obj in objs if len(obj.splats.means)]
         if not objs:
             return False
+        if _count(objs) > _room():
+            objs = [replace(obj, levels=None) for obj in objs]
         if self._pool is None or not self._pool.holds(objs):
             self._pool = self._entries = None
             self._pool = _Pool(objs)
@@ -179,12 +182,11 @@ class _Pool:
         starts = np.cumsum([0, *(len(arrays.means) for arrays in self._arrays.values())])
         self.starts = {key: int(start) for key, start in zip(self._arrays, starts)}
         count = int(starts[-1])
-        texels = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get()
-        room = min(texels // shaders.SPLAT_TEXELS, shaders.MOST_SPLATS)
-        if count > room:
+        if count > _room():
             raise TooManySplats(
-                f"The graphics driver can draw {room:,} splats at once, not {count:,}; hide some objects"
+                f"The graphics driver can draw {_room():,} splats at once, not {count:,}; hide some objects"
             )
+        texels = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get()
         most = max(arrays.harmonics.shape[1] for arrays in self._arrays.values())
         self.bands = max(bands for bands in (1, 4, 9, 16) if bands == 1 or bands <= min(most, texels // max(count, 1)))
         table = _table(count * shaders.SPLAT_TEXELS, 4)
@@ -210,6 +212,17 @@ class _Pool:
             return False
         used = sum(len(arrays.means) for arrays in wanted.values())
         return sum(len(arrays.means) for arrays in self._arrays.values()) <= 2 * used + 100_000
+
+
+def _room() -> int:
+    """Return how many splats the textures can hold."""
+    texels = shaders.TABLE_WIDTH * gpu.capabilities.max_texture_size_get()
+    return min(texels // shaders.SPLAT_TEXELS, shaders.MOST_SPLATS)
+
+
+def _count(objs: Iterable[DrawnObject]) -> int:
+    """Return how many splats the textures hold for objects, with those of their levels of detail."""
+    return sum(len(arrays.means) for arrays in _arrays_of(objs).values())
 
 
 def _arrays_of(objs: Iterable[DrawnObject]) -> dict[int, SplatArrays | Merged]:

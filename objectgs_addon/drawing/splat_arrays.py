@@ -171,7 +171,10 @@ def _forget(*_: Any) -> None:
 
 
 def _undone(*_: Any) -> None:
-    _before.update(_held)
+    there = {mesh.session_uid for mesh in bpy.data.meshes}
+    held = {**_before, **_held}
+    _before.clear()
+    _before.update((uid, arrays) for uid, arrays in held.items() if uid in there)
     _held.clear()
     _selected.clear()
 

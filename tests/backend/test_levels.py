@@ -279,3 +279,11 @@ def test_marked_splats_are_drawn_one_by_one(built):
     (places,) = select([PlacedLevels(levels, np.eye(4), mixed)], view_from((0, -1200, 800)), 1.0, 10)
     assert np.array_equal(places[:BLOCK], np.arange(BLOCK))
     assert [own[place] for place in places if levels.firsts[1, 1] <= place] == [2.0, *[0.0] * 18]
+
+
+def test_an_object_of_no_size_is_no_error(built):
+    """As while it is scaled to 0, also where fewer splats have to be drawn."""
+    _, levels = built
+    for matrix in (np.diag([0.0, 0, 0, 1]), np.diag([1.0, 0, 1, 1])):
+        (places,) = select([PlacedLevels(levels, matrix)], view_from((0, -12, 8)), 1.0, 10)
+        assert len(places) > 0

@@ -6,7 +6,6 @@ import argparse
 import functools
 import statistics
 from collections.abc import Callable
-from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -64,13 +63,15 @@ _TIMED_VIEWS = 3
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Begin, resume or extend a training, and write a checkpoint, previews, splats.ply and anchors.ply."""
-    choose_gpu()
+    if options.device != "cpu":
+        choose_gpu()
     options.memory_mb /= processes_here()
     if is_follower():
         follow(options)
         return
     device = choose_device(options.device, reporter)
-    with closing(connect(device)) as team:
+    team = connect(device)
+    with team.leading():
         _train(team, options, device, reporter)
 
 

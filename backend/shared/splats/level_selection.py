@@ -81,7 +81,9 @@ def _in_view(levels: Levels, matrix: NDArray, full: NDArray | None, view: View) 
     scales = np.full(len(blocks), max(abs(view.fx), abs(view.fy)) * stretch)
     if not view.orthographic:
         scales /= np.maximum(centers[blocks, 2] - radii[blocks], view.near)
-    errors = levels.errors[blocks] * scales[:, None].astype(np.float32)
+    # Objects may have a scale of 0, and the last block may not have all levels.
+    with np.errstate(invalid="ignore"):
+        errors = np.nan_to_num(levels.errors[blocks] * scales[:, None].astype(np.float32), nan=np.inf, posinf=np.inf)
     if full is not None:
         errors[full[blocks], 1:] = np.inf
     return blocks, errors

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from ...raster import devices
 from ...shared.errors import InputError
 from ..check_finite import Fault
 from ..growth_strategy import ViewStatistics
@@ -28,6 +29,10 @@ class Outcome(NamedTuple):
 
     gradients: ViewGradients | None
     fault: Fault | None
+
+
+def _on(fault: Fault, device: torch.device) -> Fault:
+    return fault._replace(anchors=fault.anchors.to(device), unrecoverable=fault.unrecoverable.to(device))
 
 
 class SharedViews:
@@ -66,8 +71,8 @@ class SharedViews:
             if problem is not None:
                 raise problem
             return [own]
-        said = self._encoded(str(problem).encode() if problem else b"")
-        fault = self._encoded(pickle.dumps(own.fault) if own.fault else b"")
+        said = self._encoded(str(problem).encode(errors="replace") if problem else b"")
+        fault = self._encoded(pickle.dumps(_on(own.fault, devices.CPU)) if own.fault else b"")
         number = torch.tensor([anchors], device=self._device)
         everyone = self._team.exchange([said, fault, number, *self._packed(own.gradients)])
         for text, *_ in everyone:
@@ -76,7 +81,7 @@ class SharedViews:
         if len({int(number) for _, _, number, *_ in everyone}) > 1:
             raise RuntimeError("the processes have different models")
         return [
-            Outcome(self._unpacked(rest), pickle.loads(bytes(sent.tolist())) if len(sent) else None)
+            Outcome(self._unpacked(rest), _on(pickle.loads(bytes(sent.tolist())), self._device) if len(sent) else None)
             for _, sent, _, *rest in everyone
         ]
 

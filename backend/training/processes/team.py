@@ -17,7 +17,8 @@ from typing import Any
 
 import torch
 
-from ...shared.errors import InputError, ProcessLost
+from ...raster import devices
+from ...shared.errors import Cancelled, InputError, ProcessLost
 
 _ALIGNMENT = 8
 """Bytes: each tensor of a message begins at a multiple of this."""
@@ -82,8 +83,21 @@ class Team:
         """
         return [tensors]
 
+    @contextmanager
+    def leading(self) -> Iterator[None]:
+        """At the end, and for errors between steps, tell the other processes to end; only in the first one.
+
+        For other errors, the others may wait for something else, and end when this process does.
+        """
+        try:
+            yield
+        except (InputError, OSError, Cancelled):
+            self.close()
+            raise
+        self.close()
+
     def close(self) -> None:
-        """Tell other processes to end, if they can still be reached."""
+        """Disconnect; the first process also tells the others to end."""
 
 
 class Processes(Team):
@@ -94,11 +108,19 @@ class Processes(Team):
 
         self._distributed = distributed
         self._device = device
-        # Without NCCL, as on Windows, gradients go through the memory of the CPU.
-        self._by_nccl = device.type == "cuda" and distributed.is_nccl_available()
+        # Without NCCL, gradients go through the memory of the CPU.
+        has_nccl = torch.cuda.is_available() and distributed.is_nccl_available()
         with _connected():
-            distributed.init_process_group("cpu:gloo,cuda:nccl" if self._by_nccl else "gloo", timeout=_LONGEST_WAIT)
+            distributed.init_process_group("cpu:gloo,cuda:nccl" if has_nccl else "gloo", timeout=_LONGEST_WAIT)
+        self._by_nccl = device.type == "cuda" and has_nccl
         self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
+        on_gpu = [torch.zeros(1, dtype=torch.int64) for _ in range(self.size)]
+        with _connected():
+            distributed.all_gather(on_gpu, torch.tensor([int(device.type != "cpu")]))
+        if len({int(each) for each in on_gpu}) > 1:
+            raise InputError(
+                "Some processes can use a GPU and others cannot; run `doctor`, or train with --device cpu."
+            )
 
     def tell(self, order: Order, progress: float = 0.0, closely: bool = False) -> None:
         self._broadcast(torch.tensor([order, progress, closely], dtype=torch.float64))
@@ -182,6 +204,8 @@ def _connected() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
+        if devices.is_out_of_memory(error):
+            raise
         raise ProcessLost(_LOST) from error
 
 
@@ -195,6 +219,7 @@ def connect(device: torch.device) -> Team:
         `Processes`, or a `Team` of one where torchrun has started no others.
 
     Raises:
+        InputError: not all of them can use a GPU.
         ProcessLost: another process has ended.
     """
     return Processes(device) if processes() > 1 else Team()
