@@ -99,11 +99,9 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
             with held_signals():
                 # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
                 from ..commands import COMMANDS
-                from ..commands.setup.machine import set_threads
-                from ..training.processes.team import is_follower
+                from ..commands.setup.machine import owns_stdin, set_threads
 
-                # All processes of a training have the same standard input.
-                stack.enter_context(stop.listening(read_stdin=options.json and not is_follower()))
+                stack.enter_context(stop.listening(read_stdin=options.json and owns_stdin()))
             set_threads(options.threads)
             COMMANDS[options.command](options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE

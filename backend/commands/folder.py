@@ -12,17 +12,20 @@ from typing import NamedTuple
 import numpy as np
 
 from ..capture import Capture, default_split, load_capture
+from ..labels import correct_masks
 from ..model.object_model import ObjectModel
 from ..planning.decisions import planned_capture
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.atomic import recorded, remove_abandoned
+from ..shared.formats.points_ply import read_points
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.lock import locked
 from ..shared.reconstruction.meshes import outdate_meshes
 from ..shared.reconstruction.objects import read_objects
 from ..shared.reconstruction.plan import Plan
 from ..shared.reconstruction.record import CaptureRecord, TrainingRecord, read_record, update_record
+from ..shared.stopping import StoppingReporter
 from ..training.budget import TrainingProgress
 from ..training.exposure.gains import measure_gains
 from ..training.scene import Scene
@@ -229,6 +232,16 @@ def open_trained(
         supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state), plan, training, warning is None)
+
+
+def with_corrected_masks(trained: Trained, reporter: StoppingReporter) -> Capture:
+    """Return the capture of a training with its masks corrected, as the training itself does."""
+    if not trained.capture.has_masks:
+        return trained.capture
+    ids = read_points(trained.folder.points).ids
+    scene = trained.scene
+    ignore_gaps = scene.supervise_background and not scene.zero_is_object
+    return correct_masks(trained.capture, ids, ignore_gaps, reporter.check)[0]
 
 
 def outdate_results(folder: Reconstruction) -> None:

@@ -20,11 +20,9 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from ...capture import Capture
-from ...labels import correct_masks
 from ...raster import Camera, devices
 from ...shared.errors import InputError
 from ...shared.formats.json_file import parse_json, read_json, write_json
-from ...shared.formats.points_ply import read_points
 from ...shared.formats.typed import typed
 from ...shared.reconstruction.checkpoint import CURRENT
 from ...shared.reconstruction.folder import Reconstruction
@@ -36,7 +34,7 @@ from ...training.cells.division import NO_CELL, Division, read_division
 from ...training.cells.parts import MERGED_OF, Checkpoint, for_parts
 from ...training.scene import Scene
 from ...training.state import require_checkpoint
-from ..folder import Trained, open_trained, require_reconstruction
+from ..folder import open_trained, require_reconstruction, with_corrected_masks
 
 CHECKPOINT = "checkpoint"
 """Name of the folder of a part's checkpoints in that of the part."""
@@ -150,16 +148,6 @@ def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndar
     """Return the cell of each of the positions (N, 3) in scene units, which for distant surroundings is none."""
     near = devices.host(scene.before_surroundings(torch.from_numpy(positions)))
     return np.where(near, division.cells_of(positions), NO_CELL)
-
-
-def with_corrected_masks(trained: Trained, reporter: StoppingReporter) -> Capture:
-    """Return the capture of a training with its masks corrected, as the training itself does."""
-    if not trained.capture.has_masks:
-        return trained.capture
-    ids = read_points(trained.folder.points).ids
-    scene = trained.scene
-    ignore_gaps = scene.supervise_background and not scene.zero_is_object
-    return correct_masks(trained.capture, ids, ignore_gaps, reporter.check)[0]
 
 
 def read_part(folder: Path) -> Checkpoint:

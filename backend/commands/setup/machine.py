@@ -17,7 +17,7 @@ import torch
 
 from ...raster import devices
 from ...shared.version import __version__
-from ...training.processes.team import processes_here
+from ...training.processes.team import is_follower, processes_here
 
 _PACKAGES = ("torch", "numpy", "numba", "pycolmap", "scikit-image", "manifold3d", "xatlas")
 
@@ -30,6 +30,11 @@ def set_threads(threads: int | None) -> None:
     count = max(min(threads or cores() // processes_here(), numba.config.NUMBA_NUM_THREADS), 1)
     numba.set_num_threads(count)
     torch.set_num_threads(count)
+
+
+def owns_stdin() -> bool:
+    """Return whether this process reads standard input, which all processes of a training have in common."""
+    return not is_follower()
 
 
 @contextmanager

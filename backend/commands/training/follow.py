@@ -10,8 +10,7 @@ from ...shared.events import Reporter
 from ...shared.stopping import StoppingReporter, StopRequest
 from ...training.processes.team import Order, Processes
 from ...training.trainer import Trainer
-from ..cells.folder import with_corrected_masks
-from ..folder import memory_for_targets, open_trained
+from ..folder import memory_for_targets, open_trained, with_corrected_masks
 from ..setup.device import choose_device
 
 
