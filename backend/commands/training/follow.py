@@ -29,11 +29,8 @@ def follow(options: argparse.Namespace) -> None:
             return
         options.folder, options.capture = options.out, None
         trained = open_trained(options, silent)
-        capture, gains, checkpoint = (
-            with_corrected_masks(trained, silent),
-            trained.scene.gains,
-            trained.folder.checkpoint,
-        )
+        capture = with_corrected_masks(trained, silent)
+        gains, checkpoint = trained.scene.gains, trained.folder.checkpoint
         del trained  # The model, which may be large.
         resumed = Trainer.resume(capture, checkpoint, None, memory_for_targets(options), device, gains)
         assert resumed is not None

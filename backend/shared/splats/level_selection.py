@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .levels import BLOCK, GROUP, LEVELS, Levels
-from .picking import View, _may_reach
+from .picking import View, may_reach
 
 _BINS_PER_OCTAVE, _OCTAVES = 64, 24
 """Accuracy and range of the search for the error that keeps to the budget."""
@@ -77,7 +77,7 @@ def _in_view(levels: Levels, matrix: NDArray, full: NDArray | None, view: View) 
     centers = levels.centers @ to_camera[:3, :3].T + to_camera[:3, 3]
     radii = stretch * levels.radii
     image = (0.0, 0.0, float(view.width), float(view.height))
-    blocks = np.flatnonzero(_may_reach(view, image, centers, radii, stretch * levels.extents))
+    blocks = np.flatnonzero(may_reach(view, image, centers, radii, stretch * levels.extents))
     scales = np.full(len(blocks), max(abs(view.fx), abs(view.fy)) * stretch)
     if not view.orthographic:
         scales /= np.maximum(centers[blocks, 2] - radii[blocks], view.near)

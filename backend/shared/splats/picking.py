@@ -268,7 +268,7 @@ def _neighbors(means: NDArray, extents: NDArray) -> NDArray[np.int64]:
     return np.argsort((octave << 30) | (steps[:, 0] << 2) | (steps[:, 1] << 1) | steps[:, 2], kind="stable")
 
 
-def _may_reach(view: View, rectangle: Rectangle, centers: NDArray, radii: NDArray, extents: NDArray) -> NDArray:
+def may_reach(view: View, rectangle: Rectangle, centers: NDArray, radii: NDArray, extents: NDArray) -> NDArray:
     """Test conservatively which bounding spheres of splats may reach into the rectangle: (n,) bool.
 
     centers (n, 3): in camera space; radii (n,): around the splats' centers; extents (n,): of the largest splat.
@@ -307,7 +307,7 @@ def _footprints(objects: Sequence[PickObject], view: View, rectangle: Rectangle)
         centers = np.einsum("nij,nj->ni", to_camera[:, :3, :3], np.array([obj.cloud.center for obj in shown]))
         radii = stretch * [obj.cloud.radius for obj in shown]
         extents = stretch * [obj.cloud.extent for obj in shown]
-        reaching = _may_reach(view, rectangle, centers + to_camera[:, :3, 3], radii, extents)
+        reaching = may_reach(view, rectangle, centers + to_camera[:, :3, 3], radii, extents)
         for index in np.flatnonzero(reaching):
             owner = int(classes.classes_of(shown[index].object_id))
             columns = _project(shown[index].cloud, to_camera[index], float(stretch[index]), view, rectangle)
@@ -326,11 +326,11 @@ def _project(cloud: Cloud, to_camera: NDArray, stretch: float, view: View, recta
     stretch: the largest factor by which to_camera (4, 4) scales a length.
     """
     turn, move = to_camera[:3, :3].T, to_camera[:3, 3]
-    blocks = _may_reach(view, rectangle, cloud.centers @ turn + move, stretch * cloud.radii, stretch * cloud.extents)
+    blocks = may_reach(view, rectangle, cloud.centers @ turn + move, stretch * cloud.radii, stretch * cloud.extents)
     index = cloud.splats_in_blocks(np.flatnonzero(blocks))
     centers = cloud.means[index] @ turn + move
     none = np.zeros(len(index))
-    kept = np.flatnonzero(_may_reach(view, rectangle, centers, none, stretch * cloud.reaches[index]))
+    kept = np.flatnonzero(may_reach(view, rectangle, centers, none, stretch * cloud.reaches[index]))
     index, centers = index[kept], centers[kept]
     axes = to_camera[:3, :3] @ cloud.axes[index].astype(np.float64)
     if view.orthographic:

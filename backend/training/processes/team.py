@@ -101,7 +101,7 @@ class Team:
 
 
 class Processes(Team):
-    """Several processes on one machine; created by `connect`."""
+    """Several processes, which torchrun has started."""
 
     def __init__(self, device: torch.device) -> None:
         import torch.distributed as distributed
