@@ -8,11 +8,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from backend.cli.parser import build_parser
+from backend.shared.reconstruction.cameras import Cameras, CameraView, write_cameras
 
 FARM = Path(__file__).resolve().parents[2] / "examples" / "farm"
+EACH_CAPTURE = ["train", "mesh", "evaluate", "report"]
 
 COMPILE = """
 const fs = require("fs");
@@ -50,6 +53,39 @@ def parsed(arguments):
     return build_parser().parse_args(arguments[3:])
 
 
+def start_of(name):
+    """Return the code that starts the backend in a job type of Flamenco."""
+    script = (FARM / name).read_text()
+    begin = script.index("const START")
+    return "".join(re.findall(r'"([^"]*)"', script[begin : script.index(";\n", begin)]))
+
+
+def write_views(folder, *, held_out):
+    """Write cameras.json as `train` does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    views = [
+        CameraView(f"{i}.png", folder / f"{i}.png", None, 8, 8, np.eye(3), np.eye(4), is_held_out)
+        for i, is_held_out in enumerate((held_out, False))
+    ]
+    write_cameras(folder, Cameras(folder, np.zeros(3), np.eye(4), views))
+
+
+def write_captures(folder):
+    """Write two captures, of which the second holds out a view, and another folder; return `folder`."""
+    write_views(folder / "a $b", held_out=False)
+    write_views(folder / "b's", held_out=True)
+    for own in ("a $b/sparse", "b's/images", "0"):
+        (folder / own).mkdir()
+    return folder
+
+
+def commands_of(lines):
+    """Return the commands of command lines of the backend, after checking that they concern one reconstruction."""
+    options = [build_parser().parse_args(words) for words in lines]
+    assert len({o.out if o.command == "train" else o.folder for o in options}) == 1
+    return [o.command for o in options]
+
+
 def test_flamenco_trains_cells_between_split_and_merge():
     tasks = compiled("flamenco-cells.js", capture="/c", out="/o", cells=3, cell_minutes=7.5)
     assert [task["name"] for task in tasks] == ["train", "split", "cell-0", "cell-1", "cell-2", "merge"]
@@ -69,10 +105,35 @@ def test_flamenco_renders_a_film_by_ranges():
     assert all(words[:2] == ["-b", "-P"] and words[4] == "film" for words in arguments)
 
 
+def test_flamenco_measures_each_capture_in_a_task(tmp_path):
+    settings = {"captures": "/my captures", "out": str(tmp_path / "out"), "minutes": 7.5, "objectgs": str(tmp_path)}
+    tasks = compiled("flamenco-captures.js", names="garden, bob's mug,\nkitchen,", **settings)
+    assert [task["name"] for task in tasks] == ["garden", "bob's mug", "kitchen"]
+    assert not any(task["needs"] for task in tasks)
+    assert all(command["name"] == "exec" for task in tasks for command in task["commands"])
+    lines = [[command["parameters"]["args"] for command in task["commands"]] for task in tasks]
+    assert all(commands_of([words[3:] for words in line]) == EACH_CAPTURE for line in lines)
+    train, _, evaluate, _ = lines[1]
+    options = parsed(train)
+    assert (options.capture, options.minutes) == (Path("/my captures/bob's mug"), 7.5)
+    assert options.out == tmp_path / "out" / "bob's mug" != parsed(lines[0][0]).out
+    with pytest.raises(subprocess.CalledProcessError):
+        compiled("flamenco-captures.js", names=" ,", **settings)
+
+    # A stand-in for ObjectGS, so that the code that starts it runs, too.
+    (tmp_path / "backend").mkdir()
+    (tmp_path / "backend" / "__init__.py").touch()
+    (tmp_path / "backend" / "__main__.py").write_text("import sys\nprint(sys.argv[1])\n")
+    for held_out, shown in ((True, "evaluate\n"), (False, "")):
+        write_views(options.out, held_out=held_out)
+        run = subprocess.run([sys.executable, *evaluate], check=True, capture_output=True, text=True)
+        assert run.stdout == shown
+
+
 def test_code_that_starts_the_backend_runs_it_from_any_folder(tmp_path):
     """The templates for Flamenco and OpenJD have the same."""
-    script = (FARM / "flamenco-cells.js").read_text()
-    start = "".join(re.findall(r'"([^"]*)"', script[script.index("const START") : script.index("function compileJob")]))
+    start = start_of("flamenco-cells.js")
+    assert start == start_of("flamenco-captures.js")
     template = json.loads((FARM / "openjd-cells.json").read_text())
     assert start == next(p["default"] for p in template["parameterDefinitions"] if p["name"] == "Start")
     words = [sys.executable, "-c", start, str(FARM.parents[1]), "merge", "--help"]
@@ -111,6 +172,57 @@ def test_openjd_template_trains_cells_between_split_and_merge(tmp_path):
     assert kinds["Out"] == "NONE", "steps write to one folder, not to attachments of their own"
 
 
+def test_openjd_template_measures_each_capture_in_a_task(tmp_path):
+    template = json.loads((FARM / "openjd-captures.json").read_text())
+    values = {p["name"]: str(p["default"]) for p in template["parameterDefinitions"] if "default" in p}
+    kinds = {p["name"]: p.get("dataFlow") for p in template["parameterDefinitions"]}
+    assert kinds["Captures"] == kinds["Out"] == "NONE", "workers share the folders"
+    (step,) = template["steps"]
+    (tasks,) = step["parameterSpace"]["taskParameterDefinitions"]
+    assert (tasks["name"], tasks["range"]) == ("Capture", "1-{{Param.Count}}")
+    (script,) = step["script"]["embeddedFiles"]
+    assert "{{" not in script["data"], "values that are inserted into code would have to be quoted"
+    (tmp_path / script["filename"]).write_text(script["data"])
+
+    # A stand-in for ObjectGS that trains by copying the cameras.json of the capture.
+    (tmp_path / "backend" / "cli").mkdir(parents=True)
+    (tmp_path / "backend" / "__init__.py").touch()
+    (tmp_path / "backend" / "cli" / "main.py").write_text(
+        "import json, os, shutil\n"
+        "def main(words):\n"
+        "    print(json.dumps(words), flush=True)\n"
+        "    if words[0] == 'train':\n"
+        "        shutil.copytree(words[1], words[3], dirs_exist_ok=True)\n"
+        "    return 3 if words[0] == os.environ.get('FAILS') else 0\n"
+    )
+    captures = write_captures(tmp_path / "my captures")
+    values |= {"Captures": str(captures), "Out": str(tmp_path / "out"), "ObjectGS": str(tmp_path), "Count": "2"}
+    values |= {"Minutes": "7.5"}
+
+    def run(number, count="2", fails=""):
+        own = {
+            **{f"Param.{name}": value for name, value in {**values, "Count": count}.items()},
+            "Task.Param.Capture": number, f"Task.File.{script['name']}": str(tmp_path / script["filename"]),
+        }  # fmt: skip
+        words = step["script"]["actions"]["onRun"]["args"]
+        filled = [re.sub(r"{{([\w.]+)}}", lambda match: own[match[1]], word) for word in words]
+        done = subprocess.run(
+            [sys.executable, *filled], check=False, capture_output=True, text=True, env={**os.environ, "FAILS": fails}
+        )
+        return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
+
+    for number, name, expected in (("1", "a $b", ["train", "mesh", "report"]), ("2", "b's", EACH_CAPTURE)):
+        code, lines, _ = run(number)
+        assert code == 0 and commands_of(lines) == expected
+        options = [build_parser().parse_args(words) for words in lines]
+        assert (options[0].out, options[0].minutes) == (tmp_path / "out" / name, 7.5)
+        assert {o.capture for o in options} == {captures / name}, "each worker may have another path of it"
+    code, lines, _ = run("2", fails="mesh")
+    assert code == 3 and commands_of(lines) == ["train", "mesh"]
+    code, lines, error = run("1", count="3")
+    assert code and not lines and "2 captures instead of 3" in error, "a wrong number would leave captures out"
+
+
 def test_slurm_script_submits_cells_as_an_array(tmp_path):
     if sys.platform == "win32":
         pytest.skip("the script is for bash")
@@ -140,3 +252,47 @@ def test_slurm_script_submits_cells_as_an_array(tmp_path):
     )  # fmt: skip
     arguments = task.stdout.split()
     assert arguments[:2] == ["-m", "backend"] and build_parser().parse_args(arguments[2:]).cell == 2
+
+
+def test_slurm_script_submits_captures_as_an_array(tmp_path):
+    if sys.platform == "win32":
+        pytest.skip("the script is for bash")
+    captures, out = write_captures(tmp_path / "my captures"), tmp_path / "out"
+    log, stub, python = tmp_path / "log", tmp_path / "sbatch", tmp_path / "my python"
+    stub.write_text(f'#!/bin/bash\nprintf "%s\\n" "$@" > {log}\n')
+    # Trains by copying the cameras.json of the capture.
+    python.write_text(
+        f'#!/bin/bash\n(printf "%s\\t" "$@"; echo) >> {tmp_path}/run\n'
+        'if [ "$3" = train ]; then mkdir -p "$6" && cp "$4/cameras.json" "$6"; fi\n[ "$3" != "${FAILS:-}" ]\n'
+    )
+    stub.chmod(0o755)
+    python.chmod(0o755)
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHON": str(python), "LC_ALL": "C"}
+    script = str(FARM / "slurm-captures.sh")
+    words = [script, f"{captures}/", str(out), "7.5", "--partition=gpu"]
+    subprocess.run(words, check=True, env=environment)
+    submitted = log.read_text().splitlines()
+    options, element = submitted[: submitted.index(script)], submitted[submitted.index(script) :]
+    assert {"--partition=gpu", "--array=0-1", f"--chdir={Path.cwd()}"} <= set(options)
+    del environment["PYTHON"]
+
+    def run(number, fails=""):
+        (tmp_path / "run").unlink(missing_ok=True)
+        code = subprocess.run(
+            element, check=False, env={**environment, "SLURM_ARRAY_TASK_ID": number, "FAILS": fails}
+        ).returncode
+        lines = [line.split("\t")[:-1] for line in (tmp_path / "run").read_text().splitlines()]
+        assert all(words[:2] == ["-m", "backend"] for words in lines)
+        return code, [words[2:] for words in lines]
+
+    for number, name, expected in (("0", "a $b", ["train", "mesh", "report"]), ("1", "b's", EACH_CAPTURE)):
+        code, lines = run(number)
+        assert code == 0 and commands_of(lines) == expected
+        options = build_parser().parse_args(lines[0])
+        assert (options.capture, options.out, options.minutes) == (captures / name, out / name, 7.5)
+    code, lines = run("1", fails="mesh")
+    assert code and commands_of(lines) == ["train", "mesh"]
+    nothing = subprocess.run(
+        [script, str(out), "/o", "1"], check=False, capture_output=True, env=environment, text=True
+    )
+    assert nothing.returncode and "images/" in nothing.stderr
