@@ -157,12 +157,11 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
     run_backend(
         options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest
     )
-    if not options.no_meshes:
+    for command in ["evaluate"] if options.no_meshes else ["mesh", "evaluate"]:
         try:
-            run_backend(options.reporter, "mesh", folder, folder)
-        except InputError as error:  # Splats without a surface are still a valid result.
+            run_backend(options.reporter, command, folder, folder)
+        except InputError as error:  # Splats without a surface, or without held-out views, are still a valid result.
             options.reporter.warning(str(error))
-    run_backend(options.reporter, "evaluate", folder, folder)
     run_backend(options.reporter, "report", folder, folder)
     has_meshes = build_blend(folder, folder / BLEND, options.reporter)
     render_picture(

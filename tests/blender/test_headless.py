@@ -296,6 +296,16 @@ def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path)
 
 
 @pytest.mark.long
+def test_run_succeeds_without_held_out_views(capture, backend_python, tmp_path):
+    copied, folder = shutil.copytree(capture, tmp_path / "capture"), tmp_path / "out"
+    (copied / "test.txt").write_text("")
+    ran = run("run", copied, "--out", folder, "--steps", "5", *SIZE, "--no-meshes", OBJECTGS_PYTHON=backend_python)
+    assert ran.returncode == 0, ran.output + ran.errors
+    assert "holds out no view" in ran.errors
+    assert (folder / "report.md").is_file() and (folder / "render.png").is_file()
+
+
+@pytest.mark.long
 def test_missing_backend_is_reported(capture, tmp_path):
     user = {"OBJECTGS_PYTHON": "", "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     for command in ("import", "vote", "train", "run"):
