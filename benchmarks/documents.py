@@ -28,6 +28,7 @@ FIGURES, TEMPLATES = DOCS / "figures", Path(__file__).with_name("templates")
 
 MADE_FROM_FIGURES = {
     "ablations": "benchmarks.ablations:document",
+    "cells": "benchmarks.cells:document",
     "gpu": "benchmarks.gpu_costs:document",
     "length": "benchmarks.length:document",
     "mask-noise": "benchmarks.mask_noise:document",
