@@ -3,30 +3,77 @@
 from __future__ import annotations
 
 import json
+import math
 import os
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import atomic_file, make_folder, replace_file
 from ..shared.formats.json_file import parse_json
-from ..shared.formats.regular_file import require_regular
-from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, PREVIOUS
+from ..shared.formats.regular_file import open_regular
+from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, LENGTH_BYTES, PREVIOUS, stored_header
 
-_TYPES = {np.dtype("<f4"): "F32", np.dtype("<f8"): "F64", np.dtype("<i4"): "I32", np.dtype("<i8"): "I64"}
+_TYPES: dict[np.dtype[Any], str] = {
+    np.dtype("<f4"): "F32",
+    np.dtype("<f8"): "F64",
+    np.dtype("<i4"): "I32",
+    np.dtype("<i8"): "I64",
+}
 """Types of tensors, and their names in the format."""
 
+_DTYPES: dict[str, np.dtype[Any]] = {name: dtype for dtype, name in _TYPES.items()}
+
 Tensors = dict[str, np.ndarray]
-Check = Callable[[Tensors, dict[str, Any]], None]
+Check = Callable[[Mapping[str, np.ndarray], dict[str, Any]], None]
 
 
-def _accept(_tensors: Tensors, _state: dict[str, Any]) -> None:
+def _accept(_tensors: Mapping[str, np.ndarray], _state: dict[str, Any]) -> None:
     """Accept any tensors and state."""
+
+
+class _Stored(Mapping[str, np.ndarray]):
+    """The tensors of a file in the format safetensors, of which each is read when it is asked for, and not kept.
+
+    The package's own functions map the file, so that all of it counts as memory of the process.
+
+    Args:
+        file: the open file.
+        former: names of tensors in files of older versions, and their present names.
+
+    Raises:
+        ValueError, KeyError, TypeError: the file is damaged; also when a tensor is read.
+    """
+
+    def __init__(self, file: BufferedReader, former: Mapping[str, str]) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+        header, self._start = stored_header(file)
+        self.state = dict(parse_json(header.pop("__metadata__")["state"]))
+        self._entries = {former.get(name, name): entry for name, entry in header.items()}
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        entry = self._entries[name]
+        dtype, shape, (first, last) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
+        if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != last - first or last > self._size:
+            raise ValueError(f"{name} has another size")
+        self._file.seek(self._start + first)
+        values = np.empty(shape, dtype)
+        if values.nbytes and self._file.readinto(values.data.cast("B")) != values.nbytes:
+            raise ValueError(f"{name} is truncated")
+        return values
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        return len(self._entries)
 
 
 def save_checkpoint(
@@ -76,7 +123,7 @@ def _write(file: BinaryIO, tensors: dict[str, np.ndarray], metadata: dict[str, s
         header[name] = {"dtype": _TYPES[values.dtype], "shape": list(values.shape), "data_offsets": [first, end]}
     encoded = json.dumps(header).encode()
     encoded += b" " * (-len(encoded) % 8)
-    file.write(struct.pack("<Q", len(encoded)) + encoded)
+    file.write(len(encoded).to_bytes(LENGTH_BYTES, "little") + encoded)
     for name in order:
         file.write(tensors[name].data)
 
@@ -86,13 +133,21 @@ def has_checkpoint(folder: Path) -> bool:
     return any((folder / name).exists() for name in (CURRENT, PREVIOUS))
 
 
-def load_checkpoint(folder: Path, check: Check = _accept) -> tuple[Tensors, dict[str, Any], str | None] | None:
+def load_checkpoint(
+    folder: Path,
+    check: Check = _accept,
+    former: Mapping[str, str] | None = None,
+    wanted: Callable[[str], bool] | None = None,
+) -> tuple[Tensors, dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
 
     Args:
         folder: The folder of the checkpoint.
-        check: Called with the tensors and the state, both as stored; raises ValueError, KeyError or TypeError if they
-            are not those of a training.
+        check: Called with all tensors and the state as stored; raises ValueError, KeyError or TypeError if they are not
+            those of a training.
+        former: Names of tensors in files of older versions, and their present names.
+        wanted: Whether a tensor is returned, by its present name; the others are checked one after another and not kept
+            in memory. None: all.
 
     Returns:
         The tensors by name, the state, and a warning or None if the checkpoint is not the latest one that was written;
@@ -107,13 +162,16 @@ def load_checkpoint(folder: Path, check: Check = _accept) -> tuple[Tensors, dict
         if not path.exists():
             continue
         try:
-            with safe_open(require_regular(path), framework="numpy") as file:
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - no dict
-                state = dict(parse_json(file.metadata()["state"]))
-            is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
-            if not is_other_version:
-                check(tensors, state)
-        except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
+            with open_regular(path) as file:
+                stored = _Stored(file, former or {})
+                state = stored.state
+                is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
+                tensors = dict(stored) if wanted is None else {}
+                if not is_other_version:
+                    check(tensors or stored, state)
+                if wanted is not None:
+                    tensors = {name: stored[name] for name in stored if wanted(name)}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             broken = path
             continue
         if is_other_version:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,15 @@ _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", 
 """Names in checkpoints written by older versions, and their current names."""
 
 
-def read_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
-    """Read the latest complete checkpoint in `folder`.
+def of_model(name: str) -> bool:
+    """Return whether a checkpoint's tensor is part of the model, not of its further training, which is larger."""
+    return not name.startswith(("adam.", "growth."))
+
+
+def read_checkpoint(
+    folder: Path, wanted: Callable[[str], bool] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
+    """Read the latest complete checkpoint in `folder`; wanted: as in `load_checkpoint`.
 
     Returns:
         The tensors, the state, and a warning or None; None if there is no checkpoint.
@@ -48,20 +55,21 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]
     Raises:
         InputError: there are checkpoint files, but none can be read.
     """
-    found = load_checkpoint(folder, lambda tensors, state: _check_training(*_renamed(tensors, state)))
+    found = load_checkpoint(
+        folder, lambda tensors, state: _check_training(tensors, _renamed(state)), _FORMER_TENSORS, wanted
+    )
     if found is None:
         return None
     tensors, state, warning = found
-    return *_renamed(tensors, state), warning
+    return tensors, _renamed(state), warning
 
 
-def _renamed(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _renamed(state: dict[str, Any]) -> dict[str, Any]:
     """Replace names of older versions by the present ones."""
-    tensors = {_FORMER_TENSORS.get(name, name): tensor for name, tensor in tensors.items()}
     state = {_FORMER_KEYS.get(key, key): value for key, value in state.items()}
     for part in ("normalization", "progress"):
         state[part] = {_FORMER_KEYS.get(key, key): value for key, value in state[part].items()}
-    return tensors, state
+    return state
 
 
 def training_tensors(
@@ -145,9 +153,11 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
     )  # fmt: skip
 
 
-def require_checkpoint(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
+def require_checkpoint(
+    folder: Path, wanted: Callable[[str], bool] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Return the result of `read_checkpoint`; raise InputError also if there is no checkpoint."""
-    found = read_checkpoint(folder)
+    found = read_checkpoint(folder, wanted)
     if found is None:
         raise InputError(f"{folder} contains no checkpoint; train first.")
     return found
@@ -166,7 +176,7 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    tensors, state, warning = require_checkpoint(folder)
+    tensors, state, warning = require_checkpoint(folder, of_model)
     model = model_from_checkpoint(tensors, state)
     return Average.from_checkpoint(tensors, model, Region.of(state).fixed).of(model).to(device), state, warning
 
@@ -176,7 +186,7 @@ def progress_of(state: dict[str, Any]) -> TrainingProgress:
     return TrainingProgress(**json.loads(json.dumps(state["progress"])))
 
 
-def _check_training(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> None:
+def _check_training(tensors: Mapping[str, np.ndarray], state: dict[str, Any]) -> None:
     """Check that tensors and state are those that `training_tensors` and `Trainer.save` write.
 
     Types, shapes, values that are not finite, and indices are checked, so that nothing fails later.

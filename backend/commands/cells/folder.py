@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
 
 from ...capture import Capture
 from ...raster import Camera, devices
 from ...shared.errors import InputError
 from ...shared.formats.json_file import parse_json, read_json, write_json
+from ...shared.formats.regular_file import open_regular
 from ...shared.formats.typed import typed
-from ...shared.reconstruction.checkpoint import CURRENT
+from ...shared.reconstruction.checkpoint import CURRENT, stored_header
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.lock import FolderInUse, locked
 from ...shared.reconstruction.record import TrainingRecord
@@ -33,7 +33,7 @@ from ...training.budget import TrainingProgress
 from ...training.cells.division import NO_CELL, Division, read_division
 from ...training.cells.parts import MERGED_OF, Checkpoint, for_parts
 from ...training.scene import Scene
-from ...training.state import require_checkpoint
+from ...training.state import of_model, require_checkpoint
 from ..folder import open_trained, require_reconstruction, with_corrected_masks
 
 CHECKPOINT = "checkpoint"
@@ -151,10 +151,10 @@ def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndar
 
 
 def read_part(folder: Path) -> Checkpoint:
-    """Return the checkpoint in a folder of cells/; raise InputError if there is none or it is damaged."""
+    """Return the model in a folder of cells/, as in its checkpoint; raise InputError if it is missing or damaged."""
     damaged = InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
     try:
-        tensors, state, warning = require_checkpoint(folder)
+        tensors, state, warning = require_checkpoint(folder, of_model)
     except InputError as error:
         raise damaged from error
     if warning:
@@ -167,9 +167,9 @@ def require_unchanged(folder: Reconstruction, division: Division, folders: CellF
     """Raise InputError if a reconstruction's model is neither the divided one nor merged of its cells."""
     try:
         # Without the tensors, which may take much of the memory.
-        with safe_open(folder.checkpoint / CURRENT, framework="numpy") as file:
-            merged_of = parse_json(file.metadata()["state"]).get(MERGED_OF)
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        with open_regular(folder.checkpoint / CURRENT) as file:
+            merged_of = parse_json(stored_header(file)[0]["__metadata__"]["state"]).get(MERGED_OF)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{folder.checkpoint / CURRENT} is missing or damaged; train again.") from error
     if merged_of != _digest(folders.division) and digest_of(folder.checkpoint) != division.checkpoint:
         raise InputError(

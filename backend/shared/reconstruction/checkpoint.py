@@ -8,11 +8,10 @@ contains the training state as a JSON string with `format`, `progress`, `setting
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ..formats.json_file import parse_json
 from ..formats.regular_file import open_regular
@@ -23,6 +22,8 @@ FORMAT = 1
 """Version of a checkpoint's tensors and state."""
 LONGEST_HEADER = 1 << 26
 """Maximum header length in bytes; longer headers are invalid."""
+LENGTH_BYTES = 8
+"""Number of bytes of the header's length."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,21 @@ class CheckpointHeader:
     zero_is_background: bool = False
 
 
+def stored_header(file: BinaryIO) -> tuple[dict[str, Any], int]:
+    """Return the header of an open checkpoint, and the position of the first tensor; raise ValueError if it is damaged.
+
+    The header maps the names of tensors to their `dtype`, `shape` and `data_offsets`, and `__metadata__` to a mapping
+    with the `state`.
+    """
+    length = int.from_bytes(file.read(LENGTH_BYTES), "little")
+    if length > LONGEST_HEADER:
+        raise ValueError("the header is too long")
+    header = parse_json(file.read(length))
+    if not isinstance(header, dict):
+        raise ValueError("the header is no object")
+    return header, LENGTH_BYTES + length
+
+
 def read_header(folder: Path) -> CheckpointHeader | None:
     """Read the header of the newest checkpoint, without its tensors.
 
@@ -52,13 +68,12 @@ def read_header(folder: Path) -> CheckpointHeader | None:
     """
     try:
         with open_regular(folder / CURRENT) as file:
-            (length,) = struct.unpack("<Q", file.read(8))
-            header = parse_json(file.read(min(length, LONGEST_HEADER)))
+            header, _ = stored_header(file)
         state = parse_json(header["__metadata__"]["state"])
         progress = state["progress"]
         steps, seconds = int(progress["step"]), float(progress["seconds"])
         return CheckpointHeader(steps, seconds, _latest(progress), state.get("supervise_background") is True)
-    except (OSError, ValueError, KeyError, TypeError, struct.error):
+    except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
