@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ..model.object_model import ObjectModel
-from ..model.splats import Splats
+from ..model.splats import Splats, blocks
 from ..raster import devices
-from ..shared.formats.anchors_ply import AnchorTable, write_anchor_table
+from ..shared.formats.anchors_ply import AnchorTable, write_anchor_tables
 from .ply import position_kind
 
 
@@ -25,18 +25,25 @@ def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.nda
         source: (N,) int64, the offset that each splat was generated from: anchor * offsets + offset.
     """
     anchors = model.anchors
-    count = len(anchors)
-    owner = source // anchors.layout.offsets
-    numbers = np.bincount(owner, minlength=count)
-    opacity = np.bincount(owner, splats.opacities, count) / np.maximum(numbers, 1)
-    # The same limit as in the model (LOG_EXTENT_MAX).
-    logs = devices.host(anchors.rows[:, anchors.layout.extent_columns][:, :3])
-    extents = np.exp(np.minimum(logs.astype(np.float64), 20.0))
-    table = AnchorTable(
-        model.normalization.to_world(devices.host(anchors.positions)),
-        model.classes.ids_of(devices.host(anchors.ids)),
-        extents / model.normalization.scale,
-        opacity,
-        numbers,
-    )
-    write_anchor_table(path, table, position_kind(splats))
+    count, k = len(anchors), anchors.layout.offsets
+    numbers, opacities = np.zeros(count, np.int64), np.zeros(count)
+    for rows in blocks(len(source)):
+        owner = source[rows] // k
+        # Summed in the order of the splats, so that the sums do not depend on the blocks.
+        np.add.at(numbers, owner, 1)
+        np.add.at(opacities, owner, splats.opacities[rows])
+    opacities /= np.maximum(numbers, 1)
+
+    def table(rows: slice) -> AnchorTable:
+        # The same limit as in the model (LOG_EXTENT_MAX).
+        logs = devices.host(anchors.rows[rows, anchors.layout.extent_columns][:, :3])
+        extents = np.exp(np.minimum(logs.astype(np.float64), 20.0))
+        return AnchorTable(
+            model.normalization.to_world(devices.host(anchors.positions[rows])),
+            model.classes.ids_of(devices.host(anchors.ids[rows])),
+            extents / model.normalization.scale,
+            opacities[rows],
+            numbers[rows],
+        )
+
+    write_anchor_tables(path, count, map(table, blocks(count)), position_kind(splats))

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import Splats
+from ..model.splats import Splats, blocks
 from ..shared.class_table import LARGEST_ID
-from ..shared.formats.atomic import atomic_file
-from ..shared.formats.ply import vertex_header
+from ..shared.formats.ply import write_vertex_blocks
 from ..shared.formats.splat_ply import (
     MEANS,
     OBJECT_ID,
@@ -35,7 +34,6 @@ OPACITY_MARGIN = 1e-7
 
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
-ROWS_AT_ONCE = 1 << 16
 
 
 def write_splats(
@@ -75,10 +73,9 @@ def write_splats(
         names.append(UNOBSERVED)
     dtype = splat_dtype(names, position_kind(splats))
 
-    with atomic_file(path) as file:
-        file.write(vertex_header(dtype, len(splats), [background_comment(background)] if background else []))
-        for start in range(0, len(splats), ROWS_AT_ONCE):
-            file.write(_rows(splats, slice(start, start + ROWS_AT_ONCE), dtype).tobytes())
+    comments = [background_comment(background)] if background else []
+    tables = (_rows(splats, rows, dtype) for rows in blocks(len(splats)))
+    write_vertex_blocks(path, dtype, len(splats), tables, comments)
     return warnings
 
 
@@ -115,9 +112,10 @@ def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
 def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray, sh: NDArray) -> NDArray:
     """Find the splats with finite values and a nonzero quaternion, (N,) bool."""
     keep = np.isfinite(opacities)
-    for values in (means, quats, scales, sh):
-        keep &= np.isfinite(values.reshape(len(keep), math.prod(values.shape[1:]))).all(axis=1)
-    keep &= np.abs(quats).max(axis=1, initial=0.0) > SMALLEST_QUAT
+    for rows in blocks(len(keep)):
+        for values in (means[rows], quats[rows], scales[rows], sh[rows]):
+            keep[rows] &= np.isfinite(values.reshape(len(values), math.prod(values.shape[1:]))).all(axis=1)
+        keep[rows] &= np.abs(quats[rows]).max(axis=1, initial=0.0) > SMALLEST_QUAT
     return keep
 
 
@@ -125,8 +123,9 @@ def position_kind(splats: Splats) -> str:
     """Return `f8` if float32 would change positions by more than 1e-6 of the splats' extent, otherwise `f4`."""
     if len(splats) == 0 or splats.means.dtype != np.float64:
         return "f4"
-    extent = float(np.ptp(splats.means, axis=0).max() + splats.scales.max())
-    return "f8" if float(np.abs(splats.means).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
+    low, high = splats.means.min(0), splats.means.max(0)
+    extent = float((high - low).max() + splats.scales.max())
+    return "f8" if float(np.maximum(-low, high).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
 
 
 def rounding_warnings(path: Path, splats: Splats, step: float) -> list[str]:

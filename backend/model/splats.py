@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+
+ROWS_AT_ONCE = 1 << 16
+"""Number of splats that are converted or written at a time, since models may take half of the memory."""
 
 
 @dataclass
@@ -106,3 +109,8 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         np.concatenate([part.object_ids for part in parts]),
         np.concatenate([part.unobserved for part in parts]),
     )
+
+
+def blocks(count: int) -> Iterator[slice]:
+    """Divide `count` rows into blocks of at most ROWS_AT_ONCE."""
+    return (slice(start, min(start + ROWS_AT_ONCE, count)) for start in range(0, count, ROWS_AT_ONCE))

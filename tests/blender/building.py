@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from objectgs.backend.shared.formats import points_ply
-from objectgs.backend.shared.formats.anchors_ply import AnchorTable, write_anchor_table
+from objectgs.backend.shared.formats.anchors_ply import AnchorTable, write_anchor_tables
 from objectgs.backend.shared.formats.mesh_ply import Mesh, write_mesh
 from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.formats.points_ply import LabeledPoints
@@ -92,7 +92,7 @@ def write_anchors(folder: Path, ids) -> None:
     count = len(ids)
     positions = np.tile([3.0, 0.0, 0.0], (count, 1))
     anchors = AnchorTable(positions, ids, np.zeros((count, 3)), np.full(count, 0.25), np.full(count, 7))
-    write_anchor_table(folder / "anchors.ply", anchors, "f4")
+    write_anchor_tables(folder / "anchors.ply", count, [anchors], "f4")
 
 
 def write_folder(place: Path) -> Path:

@@ -6,13 +6,14 @@ their logarithms; opacity, the mean over the anchor's splats, 0 if it has none; 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
-from .ply import read_vertices, write_vertices
+from .ply import read_vertices, write_vertex_blocks
 
 _AXES = ("x", "y", "z")
 SCALES = ("scale_0", "scale_1", "scale_2")
@@ -39,13 +40,19 @@ class AnchorTable:
     splats: np.ndarray
 
 
-def write_anchor_table(path: Path, anchors: AnchorTable, position: str) -> None:
-    """Write anchors as PLY, atomically; `position` is the type of x, y and z, `f4` or `f8`."""
-    table = np.zeros(len(anchors.ids), [*((axis, position) for axis in _AXES), *_OTHERS])
+def write_anchor_tables(path: Path, count: int, tables: Iterable[AnchorTable], position: str) -> None:
+    """Write `count` anchors, given in several tables, as PLY, atomically; `position` is the type of x, y and z."""
+    dtype = np.dtype([*((axis, position) for axis in _AXES), *_OTHERS])
+    write_vertex_blocks(path, dtype, count, (_rows(table, dtype) for table in tables))
+
+
+def _rows(anchors: AnchorTable, dtype: np.dtype) -> np.ndarray:
+    """Return the records of a table of anchors."""
+    rows = np.zeros(len(anchors.ids), dtype)
     for i in range(3):
-        table[_AXES[i]], table[SCALES[i]] = anchors.positions[:, i], anchors.scales[:, i]
-    table["object_id"], table["opacity"], table["splats"] = anchors.ids, anchors.opacities, anchors.splats
-    write_vertices(path, table)
+        rows[_AXES[i]], rows[SCALES[i]] = anchors.positions[:, i], anchors.scales[:, i]
+    rows["object_id"], rows["opacity"], rows["splats"] = anchors.ids, anchors.opacities, anchors.splats
+    return rows
 
 
 def read_anchor_table(path: Path) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -42,10 +42,26 @@ def vertex_header(dtype: np.dtype, count: int, comments: Sequence[str] = ()) -> 
 
 def write_vertices(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
     """Write a structured array (N,) of scalar fields as binary little-endian PLY, atomically."""
-    packed = np.dtype([(name, table.dtype[name].newbyteorder("<")) for name in table.dtype.names or ()])
+    write_vertex_blocks(path, table.dtype, len(table), [table], comments)
+
+
+def write_vertex_blocks(
+    path: Path, dtype: np.dtype, count: int, blocks: Iterable[np.ndarray], comments: Sequence[str] = ()
+) -> None:
+    """Write `count` vertices as `write_vertices`, without having all of them in memory.
+
+    Args:
+        path: The file to write.
+        dtype: The scalar fields of all vertices.
+        count: Number of vertices.
+        blocks: Structured arrays of this type, which have `count` vertices together.
+        comments: Comments of the header.
+    """
+    packed = np.dtype([(name, dtype[name].newbyteorder("<")) for name in dtype.names or ()])
     with atomic_file(path) as file:
-        file.write(vertex_header(packed, len(table), comments))
-        file.write(np.ascontiguousarray(table.astype(packed, copy=False)).data)
+        file.write(vertex_header(packed, count, comments))
+        for block in blocks:
+            file.write(np.ascontiguousarray(block.astype(packed, copy=False)).data)
 
 
 def read_vertices(path: Path, text: bool = False) -> np.ndarray:

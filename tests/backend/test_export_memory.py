@@ -1,0 +1,68 @@
+"""The export of large models: the memory that it takes, and files that do not depend on the size of its blocks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from backend.commands.exported import export_model
+from backend.model.anchors import Layout, seed_anchors
+from backend.model.heads import Heads
+from backend.model.object_model import Normalization, ObjectModel
+from backend.raster import Camera
+from backend.shared.class_table import ClassTable
+from backend.shared.events import Reporter
+from backend.shared.formats.anchors_ply import read_anchor_table
+from backend.shared.formats.ply import read_vertices
+from backend.shared.reconstruction.folder import Reconstruction
+
+BLOCK = "backend.model.splats.ROWS_AT_ONCE"
+OF_FIT = ("backend.export.fit._ANCHORS_AT_ONCE", "backend.export.fit._SPLATS_AT_ONCE")
+
+
+def model_of(count: int, mode: str = "explicit", primitive: str = "3d", center: float = 0.0) -> ObjectModel:
+    """A model with `count` anchors of three objects and of none, whose world's origin is `center` away."""
+    rng, generator, layout = np.random.default_rng(0), torch.Generator().manual_seed(0), Layout()
+    xyz, classes = rng.uniform(-1, 1, (count, 3)), rng.integers(0, 4, count)
+    anchors = seed_anchors(xyz, rng.uniform(0, 1, (count, 3)), classes, 1e-4, layout, rng)
+    anchors.rows += torch.randn(anchors.rows.shape, generator=generator) * 0.2
+    heads = Heads(layout, mode, 1, generator).requires_grad_(False)
+    return ObjectModel(
+        anchors, heads, torch.tensor([0.2, 0.4, 0.6]), ClassTable(np.array([0, 2, 7, 2**32 - 1])),
+        Normalization((center, 0.0, 0.0), 0.3), primitive,
+    )  # fmt: skip
+
+
+def export(model: ObjectModel, out: Path, focal: float = 64.0) -> Reconstruction:
+    """Export a model that four cameras see, those with a large focal length only a small part of it."""
+
+    def camera(index: int) -> Camera:
+        c, s = np.cos(np.pi / 2 * index), np.sin(np.pi / 2 * index)
+        viewmat = np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 3], [0, 0, 0, 1]])
+        return Camera(viewmat, np.array([[focal, 0, 32], [0, focal, 24], [0, 0, 1]]), 64, 48)
+
+    capture = SimpleNamespace(test_indices=[0, 2], train_indices=[1, 3])
+    out.mkdir()
+    export_model(model, SimpleNamespace(capture=capture, camera=camera), Reconstruction(out), Reporter())
+    return Reconstruction(out)
+
+
+@pytest.mark.parametrize("mode", ["explicit", "view"])
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_files_do_not_depend_on_the_size_of_blocks(tmp_path, monkeypatch, mode, primitive):
+    model = model_of(300, mode, primitive, center=1e6)
+    model.anchors.rows[[7, 200], model.anchors.layout.shape_columns] = torch.nan
+    whole = export(model, tmp_path / "whole")
+    monkeypatch.setattr(BLOCK, 37)
+    for name in OF_FIT:
+        monkeypatch.setattr(name, 41)
+    parts = export(model, tmp_path / "parts")
+    assert parts.splats.read_bytes() == whole.splats.read_bytes()
+    assert parts.anchors.read_bytes() == whole.anchors.read_bytes()
+    splats, anchors = read_vertices(whole.splats), read_anchor_table(whole.anchors)
+    assert len(anchors) == 300 and anchors["splats"].sum() == len(splats) > 1000
+    assert (anchors["splats"][[7, 200]] == 0).all() and splats["x"].dtype == anchors["x"].dtype == np.float64
