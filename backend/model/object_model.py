@@ -15,7 +15,7 @@ from ..shared.class_table import ClassTable
 from .anchors import LOG_EXTENT_MAX, Anchors
 from .generate import Generated, generate
 from .heads import Heads
-from .splats import Splats
+from .splats import Splats, blocks, converted
 
 DISC_THICKNESS = 1e-3
 """Third scale of a disc in files, as a fraction of the smaller of the other two."""
@@ -122,21 +122,26 @@ class ObjectModel:
         Returns:
             Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.
         """
-        g = self.generate(camera_center=camera_center)
-        g = g.cpu()
-        quats = g.quats.double().numpy()
-        norm = np.linalg.norm(quats, axis=1, keepdims=True)
-        usable = norm[:, 0] > 1e-4
-        splats = Splats(
-            means=self.normalization.to_world(g.means.numpy()),
-            quats=(quats / np.where(norm > 0, norm, 1)).astype(np.float32),
-            scales=(g.scales.double().numpy() / self.normalization.scale),
-            opacities=g.opacities.numpy(),
-            sh=g.sh.numpy(),
-            object_ids=self.classes.ids_of(g.ids.numpy()),
-        )
-        source = g.source.numpy()
-        return (splats, source) if usable.all() else (splats.select(usable), source[usable])
+        g = self.generate(camera_center=camera_center).cpu()
+        usable = _normalize(g.quats.numpy())
+        g = g if usable.all() else g.select(torch.from_numpy(usable))
+        means, quats, scales, opacities, sh, ids, source = (part.numpy() for part in g[:7])
+        # Each array is freed when its conversion replaces it, since those of all splats are large.
+        del g
+        means = converted(means, self.normalization.to_world)
+        scales = converted(scales, lambda values: values.astype(np.float64) / self.normalization.scale)
+        ids = converted(ids, self.classes.ids_of, np.int64)
+        return Splats(means, quats, scales, opacities, sh, ids), source
+
+
+def _normalize(quats: np.ndarray) -> np.ndarray:
+    """Divide quaternions (N, 4) by their norms, in place; returns (N,) bool, which of them are rotations."""
+    usable = np.empty(len(quats), np.bool_)
+    for rows in blocks(len(quats)):
+        norm = np.linalg.norm(quats[rows].astype(np.float64), axis=1, keepdims=True)
+        usable[rows] = norm[:, 0] > 1e-4
+        quats[rows] /= np.where(norm > 0, norm, 1)
+    return usable
 
 
 @kernel(parallel=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 ROWS_AT_ONCE = 1 << 16
 """Number of splats that are converted or written at a time, since models may take half of the memory."""
@@ -114,3 +114,11 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
 def blocks(count: int) -> Iterator[slice]:
     """Divide `count` rows into blocks of at most ROWS_AT_ONCE."""
     return (slice(start, min(start + ROWS_AT_ONCE, count)) for start in range(0, count, ROWS_AT_ONCE))
+
+
+def converted(values: NDArray, convert: Callable[[NDArray], NDArray], kind: DTypeLike = np.float64) -> NDArray:
+    """Return convert(values), of the same shape and of the type `kind`, computed in blocks of rows."""
+    out = np.empty(values.shape, kind)
+    for rows in blocks(len(values)):
+        out[rows] = convert(values[rows])
+    return out
