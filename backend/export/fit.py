@@ -9,7 +9,8 @@ directly, 32.6 dB with degree 1, and 29.2 dB for splats generated from the cente
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from ..evaluation.metrics import psnr
 from ..model.draw import draw
 from ..model.object_model import ObjectModel, anchors_in_view
-from ..model.splats import Splats, concatenate
+from ..model.splats import Splats, gathered
 from ..raster import Camera, devices, rasterize
 from ..raster.reference import rotation_matrices
 from ..shared.events import Reporter
@@ -57,17 +58,21 @@ def fit_splats(
     """
     reporter = reporter or Reporter()
     taken = np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), MAX_VIEWS)).astype(int))
-    starts = range(0, len(model.anchors), _ANCHORS_AT_ONCE)
-    parts: list[Splats] = []
-    sources = [np.zeros(0, np.int64)]
-    for start in starts:
-        sums = _Sums(model, start, min(start + _ANCHORS_AT_ONCE, len(model.anchors)))
+    count, k = len(model.anchors), model.anchors.layout.offsets
+    starts = range(0, count, _ANCHORS_AT_ONCE)
+    sources: list[NDArray[np.int64]] = []
+
+    def fit_part(start: int) -> Iterator[Splats]:
+        sums = _Sums(model, start, min(start + _ANCHORS_AT_ONCE, count))
         for done, index in enumerate(taken, 1):
             sums.add(cameras[index])
-            reporter.progress(len(parts) * len(taken) + done, len(starts) * len(taken), what="views")
-        parts.append(sums.splats())
-        sources.append(sums.used() + start * model.anchors.layout.offsets)
-    return concatenate(parts) if parts else Splats.empty(SH_DEGREE), np.concatenate(sources)
+            reporter.progress(len(sources) * len(taken) + done, len(starts) * len(taken), what="views")
+        sources.append(sums.used() + start * k)
+        yield from sums.splats()
+
+    if not count:
+        return Splats.empty(SH_DEGREE), np.zeros(0, np.int64)
+    return gathered(itertools.chain.from_iterable(map(fit_part, starts)), count * k), np.concatenate(sources)
 
 
 class Agreement(NamedTuple):
@@ -166,11 +171,11 @@ class _Sums:
         """Return the offsets whose splats are visible in a view, relative to the first offset: (n,), ascending."""
         return np.flatnonzero(self.weight > 0)
 
-    def splats(self) -> Splats:
-        """Return the fitted splats in world units, in the order of `used`."""
+    def splats(self) -> Iterator[Splats]:
+        """Yield the fitted splats in world units, in the order of `used`, in one part or more."""
         used = self.used()
-        pieces = np.split(used, range(_SPLATS_AT_ONCE, len(used), _SPLATS_AT_ONCE))
-        return concatenate([self._fitted(piece) for piece in pieces])
+        for piece in np.split(used, range(_SPLATS_AT_ONCE, len(used), _SPLATS_AT_ONCE)):
+            yield self._fitted(piece)
 
     def _fitted(self, slots: NDArray) -> Splats:
         model, weight = self.model, self.weight[slots].astype(np.float64)[:, None]

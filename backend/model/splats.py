@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,6 +109,24 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         np.concatenate([part.object_ids for part in parts]),
         np.concatenate([part.unobserved for part in parts]),
     )
+
+
+def gathered(parts: Iterable[Splats], most: int) -> Splats:
+    """Concatenate splats while they are made, so that there is no second copy of them.
+
+    Args:
+        parts: splats of one degree and of the same types; one part or more.
+        most: upper bound of the number of splats. Rows that are not filled take addresses, but no memory.
+    """
+    whole: dict[str, NDArray] = {}
+    count = 0
+    for part in parts:
+        for name, values in vars(part).items():
+            if name not in whole:
+                whole[name] = np.empty((most, *values.shape[1:]), values.dtype)
+            whole[name][count : count + len(part)] = values
+        count += len(part)
+    return Splats(**{name: values[:count] for name, values in whole.items()})
 
 
 def blocks(count: int) -> Iterator[slice]:
