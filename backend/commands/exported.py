@@ -60,7 +60,7 @@ def _write_export(
     if compare:
         most = _COMPARED_VIEWS if _is_approximate(model) else _CHECKED_VIEWS
         views = (capture.test_indices or capture.train_indices)[:most]
-        found = agreement(model, splats, [scene.camera(i) for i in views])
+        found = agreement(model, splats, source, [scene.camera(i) for i in views])
         psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
     for sentence in write_splats(folder.splats, splats, background=background):

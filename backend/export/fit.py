@@ -82,38 +82,51 @@ class Agreement(NamedTuple):
     on_black: float
 
 
-def agreement(model: ObjectModel, splats: Splats, cameras: Sequence[Camera]) -> Agreement | None:
+def agreement(
+    model: ObjectModel, splats: Splats, source: NDArray[np.int64], cameras: Sequence[Camera]
+) -> Agreement | None:
     """Measure how well plain splats reproduce a model, whose renders have its background.
 
     Args:
         model: The model.
-        splats: The exported splats in world units.
+        splats: The N exported splats in world units.
+        source: (N,) int64, the offset that each was generated from: anchor * offsets + offset.
         cameras: The cameras in scene units.
 
     Returns:
         The agreement; None if there are no cameras.
     """
+    found = [_agreement(model, splats, source, camera) for camera in cameras]
+    return Agreement(*np.mean(found, axis=0).tolist()) if found else None
+
+
+def _agreement(model: ObjectModel, splats: Splats, source: NDArray[np.int64], camera: Camera) -> list[float]:
+    """Return the figures of one view, for which only splats of anchors in view are converted."""
 
     def tensor(values: NDArray) -> torch.Tensor:
         return devices.upload(np.ascontiguousarray(values, np.float32), model.device)
 
-    means = tensor(model.normalization.to_scene(splats.means))
-    scales = tensor(splats.scales * model.normalization.scale)
-    quats, opacities, sh = tensor(splats.quats), tensor(splats.opacities), tensor(splats.sh)
-    ids = torch.zeros(len(splats), dtype=torch.int32, device=model.device)
+    wanted = draw(model, camera, want_ids=False).image
+    in_view = np.zeros(len(model.anchors), np.bool_)
+    in_view[devices.host(_anchors_in_view(model, camera))] = True
+    rows = np.flatnonzero(np.repeat(in_view, model.anchors.layout.offsets)[source])
+    means = tensor(model.normalization.to_scene(splats.means[rows]))
+    scales = tensor(splats.scales[rows] * model.normalization.scale)
+    quats, opacities, sh = tensor(splats.quats[rows]), tensor(splats.opacities[rows]), tensor(splats.sh[rows])
+    ids = torch.zeros(len(rows), dtype=torch.int32, device=model.device)
+    with torch.no_grad():
+        drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
+    gain = torch.tensor(camera.gain).to(drawn.color.device)[:, None, None]
     background = model.background.detach()
     found = []
-    for camera in cameras:
-        with torch.no_grad():
-            drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
-        wanted = draw(model, camera, want_ids=False).image
-        gain = torch.tensor(camera.gain).to(drawn.color.device)[:, None, None]
-        both = []
-        for behind in (background, torch.zeros_like(background)):
-            image = (drawn.color + (1 - drawn.alpha) * behind[:, None, None]) * gain
-            both.append(psnr(devices.host(image.clamp(0, 1).permute(1, 2, 0)), wanted))
-        found.append(both)
-    return Agreement(*np.mean(found, axis=0).tolist()) if found else None
+    for behind in (background, torch.zeros_like(background)):
+        image = (drawn.color + (1 - drawn.alpha) * behind[:, None, None]) * gain
+        found.append(psnr(devices.host(image.clamp(0, 1).permute(1, 2, 0)), wanted))
+    return found
+
+
+def _anchors_in_view(model: ObjectModel, camera: Camera) -> torch.Tensor:
+    return anchors_in_view(model.anchors, *camera.arrays(), camera.width, camera.height, camera.near)
 
 
 class _Sums:
@@ -140,8 +153,7 @@ class _Sums:
     def add(self, camera: Camera) -> None:
         """Add the view of one camera."""
         model = self.model
-        viewmat, intrinsics = camera.arrays()
-        seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
+        seen = _anchors_in_view(model, camera)
         g = model.generate(seen, camera.center)
         # The gradient of the image's sum with respect to a splat's color is the number of pixels it covers.
         black = torch.zeros_like(g.sh).requires_grad_()

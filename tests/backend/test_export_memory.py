@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -49,6 +50,19 @@ def export(model: ObjectModel, out: Path, focal: float = 64.0) -> Reconstruction
     out.mkdir()
     export_model(model, SimpleNamespace(capture=capture, camera=camera), Reconstruction(out), Reporter())
     return Reconstruction(out)
+
+
+@pytest.mark.parametrize(("focal", "most"), [(2000.0, 165), (64.0, 330)], ids=["few in view", "all in view"])
+def test_export_takes_little_more_than_the_splats(tmp_path, monkeypatch, focal, most):
+    monkeypatch.setattr(BLOCK, 1 << 12)
+    model = model_of(20_000)
+    export(model_of(100), tmp_path / "small")  # loads the kernels
+    tracemalloc.start()
+    folder = export(model, tmp_path / "large", focal)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # A splat takes 125 bytes in `Splats`, 8 for its source, and 108 in the file.
+    assert peak < most * len(read_vertices(folder.splats))
 
 
 @pytest.mark.parametrize("mode", ["explicit", "view"])
