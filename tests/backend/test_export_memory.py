@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,15 +12,18 @@ import pytest
 import torch
 
 from backend.commands.exported import export_model
+from backend.commands.training import train
 from backend.model.anchors import Layout, seed_anchors
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, ObjectModel
 from backend.raster import Camera
 from backend.shared.class_table import ClassTable
+from backend.shared.errors import EXIT_DONE
 from backend.shared.events import Reporter
 from backend.shared.formats.anchors_ply import read_anchor_table
 from backend.shared.formats.ply import read_vertices
 from backend.shared.reconstruction.folder import Reconstruction
+from backend.training.optimizer.model_optimizer import ModelOptimizer
 
 BLOCK = "backend.model.splats.ROWS_AT_ONCE"
 OF_FIT = ("backend.export.fit._ANCHORS_AT_ONCE", "backend.export.fit._SPLATS_AT_ONCE")
@@ -80,3 +84,24 @@ def test_files_do_not_depend_on_the_size_of_blocks(tmp_path, monkeypatch, mode, 
     splats, anchors = read_vertices(whole.splats), read_anchor_table(whole.anchors)
     assert len(anchors) == 300 and anchors["splats"].sum() == len(splats) > 1000
     assert (anchors["splats"][[7, 200]] == 0).all() and splats["x"].dtype == anchors["x"].dtype == np.float64
+
+
+def test_optimizer_is_freed_before_the_export(write_capture, tmp_path, run_command, monkeypatch):
+    optimizers: weakref.WeakSet[ModelOptimizer] = weakref.WeakSet()
+    living = []
+
+    class Watched(ModelOptimizer):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            optimizers.add(self)
+            living.append(len(optimizers))
+
+    def watched_export(*arguments):
+        living.append(len(optimizers))
+        return export_model(*arguments)
+
+    monkeypatch.setattr("backend.training.trainer.ModelOptimizer", Watched)
+    monkeypatch.setattr(train, "export_model", watched_export)
+    capture = write_capture(views=9, size=(64, 48)).folder
+    assert run_command("train", capture, "--out", tmp_path / "out", "--steps", 2, "--offsets", 2).code == EXIT_DONE
+    assert max(living) > 0 and living[-1] == 0

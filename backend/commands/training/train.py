@@ -125,12 +125,15 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
                 if trainer.model.explicit and progress.step:
                     export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
                 raise
-        export = export_model(trainer.shown, trainer.scene, folder, reporter)
+        model, scene = trainer.shown, trainer.scene
+        # The moments of the optimizer, and the model that is not shown, take more memory than the export.
+        del trainer
+        export = export_model(model, scene, folder, reporter)
     latest = progress.latest
     reporter.done(
-        steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(trainer.model.anchors),
+        steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(model.anchors),
         splats=str(folder.splats), psnr=latest.get("psnr"), miou=latest.get("miou"), miou_all=latest.get("miou_all"),
-        zero_is_background=trainer.scene.supervise_background,
+        zero_is_background=scene.supervise_background,
         psnr_of_export=export.psnr_of_export,
     )  # fmt: skip
 
