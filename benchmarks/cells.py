@@ -5,8 +5,9 @@
 
 The capture is one of benchmarks/aerial.py. Of the steps of the training in cells, some are those of the coarse model
 and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
-cells and in all others, for both models. --write saves the figures to docs/figures/cells.json, the text to
-docs/cells.md and pictures of the differences to docs/cells.png.
+cells and in all others, for both models. Memory is measured on a larger capture, too, in trainings of a few steps.
+--write saves the figures to docs/figures/cells.json, the text to docs/cells.md and pictures of the differences to
+docs/cells.png.
 """
 
 from __future__ import annotations
@@ -35,6 +36,11 @@ COARSE, SEAMS = 0.2, 0.05
 NEAR = 1.0
 """Distance in meters up to which a surface is near a cut."""
 
+_OPTIONS = ("--max-anchors", "100000000", "--leave-out", "dense-points")
+
+_FEW = 40
+"""Steps of trainings whose memory is measured."""
+
 _QUALITY = {"psnr": ("PSNR, dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "miou_all": ("mIoU", "{:.3f}")}
 
 
@@ -46,22 +52,34 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--large-photos", type=int, default=2000, help="photos of the capture for the memory")
+    parser.add_argument("--large-points", type=int, default=260, help="points for each of these photos")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     shared.compile_everything()
-    town = WORK / f"town-{options.photos}-{options.points_per_photo}"
-    if not (town / "labels.json").exists():
-        aerial.make(town, options.photos, points_per_photo=options.points_per_photo)
-    runs = []
+    large = measure_memory(_town(options.large_photos, options.large_points), options.cells)
+    print(large, file=sys.stderr, flush=True)
+    town, runs = _town(options.photos, options.points_per_photo), []
     for seed in options.seeds:
         runs.append(measure(town, options.photos, options.cells, options.steps, seed))
         print(runs[-1], file=sys.stderr, flush=True)
-    found = {"photos": options.photos, "cells": options.cells, "steps": options.steps, "runs": runs}
+    found = {
+        "photos": options.photos, "cells": options.cells, "steps": options.steps, "runs": runs,
+        "large_photos": options.large_photos, "large": large,
+    }  # fmt: skip
     if options.write:
         shared.save_figure(picture(town, options.photos, *folders(options.seeds[0])), documents.DOCS / "cells.png")
         documents.save("cells", found)
     print(json.dumps(found) if options.json else document(found))
+
+
+def _town(photos: int, points_per_photo: int) -> Path:
+    """Return the folder of a capture, which is made if it is missing."""
+    town = WORK / f"town-{photos}-{points_per_photo}"
+    if not (town / "labels.json").exists():
+        aerial.make(town, photos, points_per_photo=points_per_photo)
+    return town
 
 
 def folders(seed: int) -> tuple[Path, Path]:
@@ -76,9 +94,8 @@ def measure(town: Path, photos: int, cells: int, steps: int, seed: int) -> dict[
     shared.forget(parts)
     coarse, seams = round(COARSE * steps), round(SEAMS * steps)
     of_cell = (steps - coarse - seams) // cells
-    options = ["--seed", str(seed), "--max-anchors", "100000000", "--leave-out", "dense-points"]
-    of_one = _run("train", town, "--out", one, "--steps", steps, *options)
-    of_coarse = _run("train", town, "--out", parts, "--steps", coarse, *options)
+    of_one = _run("train", town, "--out", one, "--steps", steps, "--seed", seed, *_OPTIONS)
+    of_coarse = _run("train", town, "--out", parts, "--steps", coarse, "--seed", seed, *_OPTIONS)
     of_split = _run("split", parts, "--cells", cells)
     of_cells = [_run("train-cell", parts, "--cell", number, "--steps", of_cell) for number in range(cells)]
     of_merge = _run("merge", parts, "--steps", steps - coarse - cells * of_cell)
@@ -92,6 +109,24 @@ def measure(town: Path, photos: int, cells: int, steps: int, seed: int) -> dict[
         "differences": shared.in_child(
             "benchmarks.cells:differences", town=str(town), photos=photos, one=str(one), merged=str(parts)
         ),
+    }
+
+
+def measure_memory(town: Path, cells: int) -> dict[str, float]:
+    """Train a few steps both ways; returns the number of anchors and splats, and the peak memory of each process."""
+    folder = WORK / "large"
+    shared.forget(folder)
+    whole = _run("train", town, "--out", folder, "--steps", _FEW, *_OPTIONS)
+    export = json.loads((folder / "objectgs.json").read_text())["export"]
+    parts = {"split": _run("split", folder, "--cells", cells)}
+    of_cells = [_run("train-cell", folder, "--cell", number, "--steps", _FEW) for number in range(cells)]
+    parts["merge"] = _run("merge", folder, "--steps", _FEW)
+    return {
+        "anchors": export["anchors"],
+        "splats": export["splats"],
+        "one": whole["memory_gb"],
+        "cell": max(cell["memory_gb"] for cell in of_cells),
+        **{name: part["memory_gb"] for name, part in parts.items()},
     }
 
 
@@ -187,21 +222,22 @@ def document(found: Mapping[str, Any]) -> str:
             shared.spread(memory, "{:.2f}"),
         ]  # fmt: skip
 
+    ones = [run["one"] for run in runs]
     of_cell = [max(cell["memory_gb"] for cell in run["cells"]) for run in runs]
     change = [run["merged"]["psnr"] - run["one"]["psnr"] for run in runs]
-    near = [run["differences"] for run in runs]
+    near, large = [run["differences"] for run in runs], found["large"]
     lines = [
         "# Training in cells",
         "",
         f"Made by `python benchmarks/cells.py --write`: {found['photos']} aerial photos of 320 x 240 pixels, trained "
-        f"with {found['steps']:,} steps, and as {found['cells']} cells with as many steps together, those of the coarse "
-        f"model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included"
+        f"with {found['steps']:,} steps, and as {found['cells']} cells with as many steps together, those of the "
+        f"coarse model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included"
         + (f"; mean and standard deviation over {len(runs)} seeds." if len(runs) > 1 else ", one seed."),
         "",
         *shared.table(
             ["", "steps", "anchors", *(title for title, _ in _QUALITY.values()), "memory of a process, GB"],
             [
-                row("one training", found["steps"], [run["one"]["memory_gb"] for run in runs], [r["one"] for r in runs]),
+                row("one training", found["steps"], [one["memory_gb"] for one in ones], ones),
                 row("cells", found["steps"], of_cell, [run["merged"] for run in runs]),
             ],
         ),
@@ -224,6 +260,19 @@ def document(found: Mapping[str, Any]) -> str:
         ),
         "",
         "![A held-out photo, and the differences of both models to it, with the cuts between cells](cells.png)",
+        "",
+        f"The most memory that processes took on {found['large_photos']:,} such photos with {large['anchors']:,} "
+        f"anchors and {large['splats']:,} splats:",
+        "",
+        *shared.table(
+            ["", "GB", "relative to one training"],
+            [
+                [title, f"{large[name]:.2f}", f"{large[name] / large['one']:.0%}"]
+                for name, title in (
+                    ("one", "one training"), ("split", "`split`"), ("cell", "`train-cell`"), ("merge", "`merge`")
+                )
+            ],
+        ),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
