@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
 from backend.commands.setup import machine
@@ -401,6 +402,43 @@ def test_truncated_checkpoint_falls_back_with_warning(tmp_path):
     (tmp_path / PREVIOUS).unlink()
     with pytest.raises(InputError, match="truncated"):
         load_checkpoint(tmp_path)
+
+
+def test_tensors_are_those_that_were_written(tmp_path):
+    written = {
+        "x": np.arange(6, dtype=np.float32).reshape(2, 3), "former": np.arange(3), "none": np.zeros((0, 4), np.int32),
+        "one": np.array([0.5]),
+    }  # fmt: skip
+    save_checkpoint(tmp_path, written, {})
+    of_package = safetensors.numpy.load_file(tmp_path / CURRENT)
+    tensors, _, _ = load_checkpoint(tmp_path, former={"former": "present"})
+    assert set(tensors) == {"x", "present", "none", "one"}
+    for name, values in of_package.items():
+        read = tensors[{"former": "present"}.get(name, name)]
+        assert read.dtype == values.dtype and np.array_equal(read, values) and np.array_equal(read, written[name])
+    assert set(load_checkpoint(tmp_path, wanted=lambda name: name in "xy")[0]) == {"x"}
+
+
+def test_tensor_beyond_the_file_is_damage(tmp_path):
+    save_checkpoint(tmp_path, {"x": np.zeros(4, np.float32), "y": np.zeros(4, np.float32)}, {})
+    whole = (tmp_path / CURRENT).read_bytes()
+    for old, new in ((b'"shape": [4]', b'"shape": [5]'), (b"[16, 32]", b"[17, 33]"), (b"F32", b"F16")):
+        (tmp_path / CURRENT).write_bytes(whole.replace(old, new))
+        with pytest.raises(InputError, match="damaged"):
+            load_checkpoint(tmp_path)
+
+
+def test_model_is_not_read_from_a_checkpoint_with_damaged_moments(tiny, tmp_path):
+    capture, ids = tiny()
+    Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
+    tensors, state, _ = load_checkpoint(tmp_path)
+    tensors["adam.exp_avg"][0, 0] = np.nan
+    save_checkpoint(tmp_path, tensors, state)
+    _, _, warning = load_model(tmp_path)
+    assert "damaged" in warning
+    (tmp_path / PREVIOUS).unlink()
+    with pytest.raises(InputError, match="damaged"):
+        load_model(tmp_path)
 
 
 def test_full_disk_keeps_previous_checkpoint(tmp_path, monkeypatch):
