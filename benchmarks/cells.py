@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--large-photos", type=int, default=2000, help="photos of the capture for the memory")
-    parser.add_argument("--large-points", type=int, default=260, help="points for each of these photos")
+    parser.add_argument("--large-points", type=int, default=780, help="points for each of these photos")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -137,7 +137,7 @@ def load_checkpoint(
     folder: Path,
     check: Check = _accept,
     former: Mapping[str, str] | None = None,
-    wanted: Callable[[str], bool] | None = None,
+    wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None,
 ) -> tuple[Tensors, dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
 
@@ -146,8 +146,8 @@ def load_checkpoint(
         check: Called with all tensors and the state as stored; raises ValueError, KeyError or TypeError if they are not
             those of a training.
         former: Names of tensors in files of older versions, and their present names.
-        wanted: Whether a tensor is returned, by its present name; the others are checked one after another and not kept
-            in memory. None: all.
+        wanted: Returns the names of the tensors to return, for the present names of all and the state. The others are
+            checked one after another and not kept in memory. None: all.
 
     Returns:
         The tensors by name, the state, and a warning or None if the checkpoint is not the latest one that was written;
@@ -166,11 +166,13 @@ def load_checkpoint(
                 stored = _Stored(file, former or {})
                 state = stored.state
                 is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
-                tensors = dict(stored) if wanted is None else {}
+                tensors: Tensors = {}
                 if not is_other_version:
+                    if wanted is None:
+                        tensors = dict(stored)
                     check(tensors or stored, state)
-                if wanted is not None:
-                    tensors = {name: stored[name] for name in stored if wanted(name)}
+                    if wanted is not None:
+                        tensors = {key: stored[key] for key in wanted(list(stored), state)}
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             broken = path
             continue

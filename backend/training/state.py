@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from ..shared.reconstruction.objects import LARGEST_ID
 from .budget import TrainingProgress
 from .cells.region import Region
 from .exposure.photo_colors import PhotoColors
-from .optimizer.average import Average
+from .optimizer.average import PREFIX, Average
 from .optimizer.head_adam import MOMENTS, STEP, HeadAdam, checkpoint_name
 from .optimizer.row_adam import RowAdam
 from .settings import HEAD_RATES, MODES, Settings
@@ -39,13 +39,8 @@ _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", 
 """Names in checkpoints written by older versions, and their current names."""
 
 
-def of_model(name: str) -> bool:
-    """Return whether a checkpoint's tensor is part of the model, not of its further training, which is larger."""
-    return not name.startswith(("adam.", "growth."))
-
-
 def read_checkpoint(
-    folder: Path, wanted: Callable[[str], bool] | None = None
+    folder: Path, wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint in `folder`; wanted: as in `load_checkpoint`.
 
@@ -154,13 +149,43 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 
 
 def require_checkpoint(
-    folder: Path, wanted: Callable[[str], bool] | None = None
+    folder: Path, wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Return the result of `read_checkpoint`; raise InputError also if there is no checkpoint."""
     found = read_checkpoint(folder, wanted)
     if found is None:
         raise InputError(f"{folder} contains no checkpoint; train first.")
     return found
+
+
+def read_result(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
+    """Read the result of a training from its checkpoint, without what only its continuation depends on.
+
+    That takes a quarter of the memory of the whole checkpoint.
+
+    Returns:
+        The tensors, as in a checkpoint, of the mean of the model over the latest steps, the state, and a warning or
+        None.
+
+    Raises:
+        InputError: There is no checkpoint in `folder`, or none can be read.
+    """
+    tensors, state, warning = require_checkpoint(folder, _of_result)
+    mean = {name.removeprefix(PREFIX): tensors.pop(name) for name in list(tensors) if name.startswith(PREFIX)}
+    if mean:
+        rows = mean.pop("rows")
+        if "anchors.rows" in tensors:
+            rows = np.concatenate([tensors["anchors.rows"][: Region.of(state).fixed], rows])
+        tensors |= {"anchors.rows": rows, **mean}
+    return tensors, state, warning
+
+
+def _of_result(names: Collection[str], state: dict[str, Any]) -> list[str]:
+    """Return the names of the tensors that `read_result` needs."""
+    left_out = {name.removeprefix(PREFIX) for name in names if name.startswith(PREFIX)}
+    if "rows" in left_out and not Region.of(state).fixed:
+        left_out.add("anchors.rows")
+    return [name for name in names if name not in left_out and not name.startswith(("adam.", "growth."))]
 
 
 def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
@@ -176,9 +201,8 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    tensors, state, warning = require_checkpoint(folder, of_model)
-    model = model_from_checkpoint(tensors, state)
-    return Average.from_checkpoint(tensors, model, Region.of(state).fixed).of(model).to(device), state, warning
+    tensors, state, warning = read_result(folder)
+    return model_from_checkpoint(tensors, state).to(device), state, warning
 
 
 def progress_of(state: dict[str, Any]) -> TrainingProgress:
@@ -253,11 +277,15 @@ def _check_state(settings: Settings, state: dict[str, Any]) -> None:
 
 def _check_tensors(tensors: Mapping[str, np.ndarray], expected: Expected) -> None:
     for name, (dtype, shape) in expected.items():
-        tensor = tensors[name]
-        if tensor.dtype != dtype or tensor.shape != shape:
-            raise ValueError(f"{name} is {tensor.dtype} {tensor.shape}, expected {np.dtype(dtype)} {shape}")
-        if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
-            raise ValueError(f"{name} is not finite")
+        # Not assigned here, so that no tensor is kept in memory until the next one is read.
+        _check_tensor(name, tensors[name], dtype, shape)
+
+
+def _check_tensor(name: str, tensor: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
+    if tensor.dtype != dtype or tensor.shape != shape:
+        raise ValueError(f"{name} is {tensor.dtype} {tensor.shape}, expected {np.dtype(dtype)} {shape}")
+    if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
+        raise ValueError(f"{name} is not finite")
 
 
 def _check_head_moments(tensors: Mapping[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> None:

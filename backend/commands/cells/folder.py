@@ -31,9 +31,9 @@ from ...shared.reconstruction.record import TrainingRecord
 from ...shared.stopping import StoppingReporter
 from ...training.budget import TrainingProgress
 from ...training.cells.division import NO_CELL, Division, read_division
-from ...training.cells.parts import MERGED_OF, Checkpoint, for_parts
+from ...training.cells.parts import MERGED_OF, Checkpoint
 from ...training.scene import Scene
-from ...training.state import of_model, require_checkpoint
+from ...training.state import read_result
 from ..folder import open_trained, require_reconstruction, with_corrected_masks
 
 CHECKPOINT = "checkpoint"
@@ -95,7 +95,7 @@ class Divided:
 
     def read_coarse(self) -> tuple[Checkpoint, np.ndarray]:
         """Read what parts are made of: the checkpoint of the coarse model, and the cell of each anchor, (N,)."""
-        coarse = for_parts(read_part(self.folders.coarse))
+        coarse = read_part(self.folders.coarse)
         return coarse, cells_of(self.division, self.scene, coarse[0]["anchors.positions"])
 
     def cameras(self, names: Collection[str]) -> list[Camera]:
@@ -154,7 +154,7 @@ def read_part(folder: Path) -> Checkpoint:
     """Return the model in a folder of cells/, as in its checkpoint; raise InputError if it is missing or damaged."""
     damaged = InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
     try:
-        tensors, state, warning = require_checkpoint(folder, of_model)
+        tensors, state, warning = read_result(folder)
     except InputError as error:
         raise damaged from error
     if warning:

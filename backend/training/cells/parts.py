@@ -23,7 +23,7 @@ from .division import NO_CELL, Division
 from .region import Bounds, Region, inside
 
 Checkpoint = tuple[dict[str, np.ndarray], dict[str, Any]]
-"""Tensors and state of a checkpoint, as `read_checkpoint` returns them."""
+"""Tensors and state of a checkpoint, as `read_result` returns them."""
 
 NOWHERE: Bounds = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 """Bounds in which no anchors are added."""
@@ -35,20 +35,8 @@ _OF_ANCHORS = ("positions", "rows", "ids")
 
 
 def anchors_of(checkpoint: Checkpoint) -> dict[str, np.ndarray]:
-    """Return the anchors of a checkpoint, with the mean of their rows where there is one: positions, rows and ids."""
-    tensors, state = checkpoint
-    found = {name: tensors[f"anchors.{name}"] for name in _OF_ANCHORS}
-    if "mean.rows" in tensors:
-        fixed = Region.of(state).fixed
-        found["rows"] = np.concatenate([found["rows"][:fixed], tensors["mean.rows"]]) if fixed else tensors["mean.rows"]
-    return found
-
-
-def for_parts(coarse: Checkpoint) -> Checkpoint:
-    """Return the checkpoint of a coarse model without what parts are not made of, which takes most of the memory."""
-    tensors, state = coarse
-    kept = {name: value for name, value in tensors.items() if not name.startswith(("adam.", "growth.", "mean.rows"))}
-    return {**kept, **{f"anchors.{name}": value for name, value in anchors_of(coarse).items()}}, state
+    """Return the anchors of a checkpoint: positions, rows and ids."""
+    return {name: checkpoint[0][f"anchors.{name}"] for name in _OF_ANCHORS}
 
 
 def without_anchors(coarse: Checkpoint) -> Checkpoint:
@@ -192,7 +180,7 @@ def _untrained(
 ) -> dict[str, np.ndarray]:
     """Return the tensors of a checkpoint with these anchors, of which no training has begun.
 
-    The heads are the mean ones of `shared`, the tensors of the coarse model.
+    shared: tensors of the coarse model, whose heads, background and colors they have.
     """
     count, k, columns = len(anchors["ids"]), settings.offsets, settings.layout.columns
     made = {f"anchors.{name}": values for name, values in anchors.items()}
@@ -203,11 +191,7 @@ def _untrained(
         "growth.opacity": np.zeros(count, np.float32), "growth.views": np.zeros(count, np.int32),
     }  # fmt: skip
     made |= {name: value for name, value in shared.items() if name.startswith(("heads.", "colors."))}
-    made |= {name.removeprefix("mean."): value for name, value in shared.items() if name.startswith("mean.heads.")}
-    return {
-        **made, "object_ids": shared["object_ids"],
-        "background": shared.get("mean.background", shared["background"]),
-    }  # fmt: skip
+    return {**made, "object_ids": shared["object_ids"], "background": shared["background"]}
 
 
 def _on_seams(division: Division, anchors: dict[str, np.ndarray], surroundings: int) -> np.ndarray:

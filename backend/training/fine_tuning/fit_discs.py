@@ -20,7 +20,7 @@ from ...raster import devices
 from ..budget import Budget
 from ..scene import Scene
 from ..settings import Settings
-from ..state import of_model, require_checkpoint
+from ..state import read_result
 from ..trainer import Trainer
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def begin_discs(model: ObjectModel, capture: Capture, checkpoint: Path, memory_m
     Raises:
         InputError: the checkpoint cannot be read.
     """
-    tensors, state, _ = require_checkpoint(checkpoint, of_model)
+    tensors, state, _ = read_result(checkpoint)
     settings = replace(Settings(**state["settings"]), primitive="2d")
     scene = Scene(
         capture, model.classes, model.normalization, settings.zero_is_object, memory_mb,

@@ -24,7 +24,8 @@ EVERY = 4
 FRACTION, MAX_STEPS = 0.1, 100
 """The mean covers this fraction of the steps so far, since early models may be far off, but at most this number."""
 
-_PREFIX = "mean."
+PREFIX = "mean."
+"""With which the names of the mean's tensors begin in a checkpoint."""
 
 
 class Average:
@@ -71,7 +72,7 @@ class Average:
         """Return the mean as tensors for a checkpoint."""
         heads = {f"heads.{name}": value for name, value in self._heads.state_dict().items()}
         values = {"rows": self._rows, "background": self._background, **heads}
-        return {_PREFIX + name: value for name, value in values.items()}
+        return {PREFIX + name: value for name, value in values.items()}
 
     @classmethod
     def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel, fixed: int = 0) -> Average:
@@ -79,7 +80,7 @@ class Average:
 
         For checkpoints of versions without a mean, it is initialized with `model`.
         """
-        found = {name.removeprefix(_PREFIX): value for name, value in tensors.items() if name.startswith(_PREFIX)}
+        found = {name.removeprefix(PREFIX): value for name, value in tensors.items() if name.startswith(PREFIX)}
         if not found:
             return cls(model, fixed)
         average = cls(model, fixed, torch.from_numpy(found.pop("rows")).to(model.device))
