@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Training in cells against one training with as many steps: quality, memory, and the differences where cells meet.
 
-    python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 8000] [--seeds 0] [--json] [--write]
+    python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 6000] [--seeds 0] [--json] [--write]
 
 The capture is one of benchmarks/aerial.py. Of the steps of the training in cells, some are those of the coarse model
 and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
@@ -38,8 +38,11 @@ NEAR = 1.0
 
 _OPTIONS = ("--max-anchors", "100000000", "--leave-out", "dense-points")
 
-_FEW = 40
+_FEW = 100
 """Steps of trainings whose memory is measured."""
+
+_MEMORY_MB = 200
+"""Memory for photos in these trainings, so that the models take most of it."""
 
 _QUALITY = {"psnr": ("PSNR, dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "miou_all": ("mIoU", "{:.3f}")}
 
@@ -50,10 +53,10 @@ def main() -> None:
     parser.add_argument("--photos", type=int, default=576)
     parser.add_argument("--points-per-photo", type=int, default=100)
     parser.add_argument("--cells", type=int, default=4)
-    parser.add_argument("--steps", type=int, default=8000)
+    parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--large-photos", type=int, default=2000, help="photos of the capture for the memory")
-    parser.add_argument("--large-points", type=int, default=780, help="points for each of these photos")
+    parser.add_argument("--large-points", type=int, default=260, help="points for each of these photos")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
@@ -116,16 +119,18 @@ def measure_memory(town: Path, cells: int) -> dict[str, float]:
     """Train a few steps both ways; returns the number of anchors and splats, and the peak memory of each process."""
     folder = WORK / "large"
     shared.forget(folder)
-    whole = _run("train", town, "--out", folder, "--steps", _FEW, *_OPTIONS)
+    memory = ("--memory-mb", _MEMORY_MB)
+    whole = _run("train", town, "--out", folder, "--steps", _FEW, *memory, *_OPTIONS)
     export = json.loads((folder / "objectgs.json").read_text())["export"]
-    parts = {"split": _run("split", folder, "--cells", cells)}
-    of_cells = [_run("train-cell", folder, "--cell", number, "--steps", _FEW) for number in range(cells)]
-    parts["merge"] = _run("merge", folder, "--steps", _FEW)
+    parts = {"split": _run("split", folder, "--cells", cells, *memory)}
+    of_cells = [_run("train-cell", folder, "--cell", number, "--steps", _FEW, *memory) for number in range(cells)]
+    parts["merge"] = _run("merge", folder, "--steps", _FEW, *memory)
     return {
         "anchors": export["anchors"],
         "splats": export["splats"],
         "one": whole["memory_gb"],
         "cell": max(cell["memory_gb"] for cell in of_cells),
+        "idle": shared.in_child("benchmarks.cells:idle")["memory_gb"],
         **{name: part["memory_gb"] for name, part in parts.items()},
     }
 
@@ -143,6 +148,14 @@ def run(words: Sequence[str]) -> dict[str, float]:
     if command([*words, "--json"]):
         raise RuntimeError(f"{words[0]} has failed")
     return {"seconds": time.monotonic() - started, "memory_gb": peak_mb() / 1e3}
+
+
+def idle() -> dict[str, float]:
+    """Return the peak memory in GB of a process that has imported what commands need."""
+    from backend.commands.setup.machine import peak_mb
+    from backend.commands.training import train  # noqa: F401
+
+    return {"memory_gb": peak_mb() / 1e3}
 
 
 def _quality(folder: Path) -> dict[str, float]:
@@ -262,7 +275,8 @@ def document(found: Mapping[str, Any]) -> str:
         "![A held-out photo, and the differences of both models to it, with the cuts between cells](cells.png)",
         "",
         f"The most memory that processes took on {found['large_photos']:,} such photos with {large['anchors']:,} "
-        f"anchors and {large['splats']:,} splats:",
+        f"anchors and {large['splats']:,} splats, with `--memory-mb {_MEMORY_MB}` for the photos. Of it, "
+        f"{large['idle']:.2f} GB are taken by Python and its packages before anything is read:",
         "",
         *shared.table(
             ["", "GB", "relative to one training"],

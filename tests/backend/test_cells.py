@@ -405,14 +405,14 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
 
         monkeypatch.setattr(opening, name, wrapper)
 
-    def run(self, *arguments, original=Trainer.run, **options):
-        assert len(coarse) == 4 and not [reference for reference in coarse if reference() is not None]
+    def restore(cls, *arguments, original=Trainer.restore.__func__):
+        assert coarse and not [reference for reference in coarse if reference() is not None]
         coarse.clear()
-        return original(self, *arguments, **options)
+        return original(cls, *arguments)
 
     watch("open_trained")
     watch("read_part")
-    monkeypatch.setattr(Trainer, "run", run)
+    monkeypatch.setattr(Trainer, "restore", classmethod(restore))
     monkeypatch.setattr(memory, "free_memory", lambda: 1e6)
     before = contents_of(divided)
     train = ("train-cell", divided, "--cell", 0, "--steps", 3, "--capture", tmp_path / "moved")

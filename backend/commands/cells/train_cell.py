@@ -12,7 +12,7 @@ from ...shared.formats.atomic import make_folder, remove_abandoned
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget
-from ...training.cells.parts import begin_cell
+from ...training.cells.parts import Checkpoint, begin_cell
 from ...training.cells.region import inside
 from ...training.trainer import Trainer
 from ..folder import READ, memory_for_targets
@@ -90,11 +90,16 @@ def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: 
             # Even if nothing is left to train, the damaged one is replaced.
             trainer.save(checkpoint)
         return trainer
-    coarse, cell_of = divided.read_coarse()
-    tensors, state = begin_cell(coarse, divided.division, number, cell_of, divided.cameras(cell.views))
+    tensors, state = _begin(divided, number)
     if most is not None:
         state["settings"] = {**state["settings"], "max_anchors": most}
     return Trainer.restore(capture, tensors, state, memory, device, gains)
+
+
+def _begin(divided: Divided, number: int) -> Checkpoint:
+    """Return the checkpoint with which a cell begins; the coarse model is no longer in memory then."""
+    coarse, cell_of = divided.read_coarse()
+    return begin_cell(coarse, divided.division, number, cell_of, divided.cameras(divided.division.cells[number].views))
 
 
 def _trained(trainer: Trainer) -> int:
