@@ -259,7 +259,7 @@ def spread(values: Sequence[float | None], form: str) -> str:
     if len(known) < len(values):
         return ""
     mean = form.format(statistics.fmean(known))
-    return mean if len(known) < 2 else f"{mean} ± {form.format(statistics.stdev(known))}"
+    return mean if len(known) < 2 else f"{mean} ± {form.replace('+', '').format(statistics.stdev(known))}"
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
