@@ -244,7 +244,7 @@ def document(found: Mapping[str, Any]) -> str:
         "",
         f"Made by `python benchmarks/cells.py --write`: {found['photos']} aerial photos of 320 x 240 pixels, trained "
         f"with {found['steps']:,} steps, and as {found['cells']} cells with as many steps together, those of the "
-        f"coarse model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included"
+        f"coarse model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included, without a limit of anchors"
         + (f"; mean and standard deviation over {len(runs)} seeds." if len(runs) > 1 else ", one seed."),
         "",
         *shared.table(
@@ -274,8 +274,9 @@ def document(found: Mapping[str, Any]) -> str:
         "",
         "![A held-out photo, and the differences of both models to it, with the cuts between cells](cells.png)",
         "",
-        f"The most memory that processes took on {found['large_photos']:,} such photos with {large['anchors']:,} "
-        f"anchors and {large['splats']:,} splats, with `--memory-mb {_MEMORY_MB}` for the photos. Of it, "
+        f"The most memory that processes took in {_FEW} steps on {found['large_photos']:,} such photos with "
+        f"{large['anchors']:,} anchors and {large['splats']:,} splats, with `--memory-mb {_MEMORY_MB}` for the photos. "
+        "Of it, "
         f"{large['idle']:.2f} GB are taken by Python and its packages before anything is read:",
         "",
         *shared.table(

@@ -30,6 +30,7 @@ _DTYPES: dict[str, np.dtype[Any]] = {name: dtype for dtype, name in _TYPES.items
 
 Tensors = dict[str, np.ndarray]
 Check = Callable[[Mapping[str, np.ndarray], dict[str, Any]], None]
+Wanted = Callable[[Collection[str], dict[str, Any]], Collection[str]]
 
 
 def _accept(_tensors: Mapping[str, np.ndarray], _state: dict[str, Any]) -> None:
@@ -137,7 +138,7 @@ def load_checkpoint(
     folder: Path,
     check: Check = _accept,
     former: Mapping[str, str] | None = None,
-    wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None,
+    wanted: Wanted | None = None,
 ) -> tuple[Tensors, dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from ..model.anchors import Anchors
-from ..model.checkpoint import load_checkpoint
+from ..model.checkpoint import Wanted, load_checkpoint
 from ..model.growth import GrowthStatistics
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
@@ -40,7 +40,7 @@ _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", 
 
 
 def read_checkpoint(
-    folder: Path, wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None
+    folder: Path, wanted: Wanted | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint in `folder`; wanted: as in `load_checkpoint`.
 
@@ -149,7 +149,7 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 
 
 def require_checkpoint(
-    folder: Path, wanted: Callable[[Collection[str], dict[str, Any]], Collection[str]] | None = None
+    folder: Path, wanted: Wanted | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Return the result of `read_checkpoint`; raise InputError also if there is no checkpoint."""
     found = read_checkpoint(folder, wanted)
