@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Training in cells against one training with as many steps: quality, memory, and the differences where cells meet.
 
-    python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 6000] [--seeds 0] [--json] [--write]
+    python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 6000] [--seeds 0 1] [--json] [--write]
 
 The capture is one of benchmarks/aerial.py. Of the steps of the training in cells, some are those of the coarse model
 and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("--points-per-photo", type=int, default=100)
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--large-photos", type=int, default=2000, help="photos of the capture for the memory")
     parser.add_argument("--large-points", type=int, default=260, help="points for each of these photos")
     parser.add_argument("--json", action="store_true")
