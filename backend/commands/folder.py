@@ -13,6 +13,7 @@ import numpy as np
 
 from ..capture import Capture, default_split, load_capture
 from ..labels import correct_masks
+from ..model.anchors import Anchors
 from ..model.object_model import ObjectModel
 from ..planning.decisions import planned_capture
 from ..shared.errors import InputError
@@ -173,7 +174,7 @@ def open_trained(
     Args:
         options: Options with the folder, and the device to load the model on; `capture` replaces a recorded folder.
         reporter: Receives status and warnings.
-        checkpoint: Folder of the checkpoint; None: that of the reconstruction.
+        checkpoint: Folder of the checkpoint, whose anchors are left out; None: that of the reconstruction, with all.
         own: The only folder that may be written to, as several processes use the reconstruction; None: all of it.
 
     Returns:
@@ -187,7 +188,9 @@ def open_trained(
     folder = Reconstruction(options.folder)
     require_reconstruction(folder)
     record = read_record(folder)
-    model, state, warning = load_model(checkpoint or folder.checkpoint, device)
+    model, state, warning = load_model(
+        checkpoint or folder.checkpoint, device, None if checkpoint is None else _no_anchors
+    )
     if warning:
         reporter.warning(warning)
     training = record.training
@@ -232,6 +235,10 @@ def open_trained(
         supervise_background=state["supervise_background"], gains=gains,
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state), plan, training, warning is None)
+
+
+def _no_anchors(block: Anchors) -> np.ndarray:
+    return np.zeros(len(block), np.bool_)
 
 
 def with_corrected_masks(trained: Trained, reporter: StoppingReporter) -> Capture:

@@ -192,3 +192,17 @@ def new_rows(count: int, layout: Layout, rng: np.random.Generator) -> np.ndarray
     rows = np.zeros((count, layout.columns), np.float32)
     rows[:, layout.offset_columns] = rng.normal(0, 0.5, (count, 3 * layout.offsets))
     return rows
+
+
+def kept_and_added(values: torch.Tensor, kept: torch.Tensor, added: torch.Tensor) -> torch.Tensor:
+    """Return torch.cat([values[kept], added]) without a copy of the kept rows in between.
+
+    Args:
+        values: (N, ...).
+        kept: (n,) int64, indices.
+        added: (m, ...).
+    """
+    result = values.new_empty((len(kept) + len(added), *values.shape[1:]))
+    torch.index_select(values, 0, kept, out=result[: len(kept)])
+    result[len(kept) :] = added
+    return result

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -30,14 +30,13 @@ _DTYPES: dict[str, np.dtype[Any]] = {name: dtype for dtype, name in _TYPES.items
 
 Tensors = dict[str, np.ndarray]
 Check = Callable[[Mapping[str, np.ndarray], dict[str, Any]], None]
-Wanted = Callable[[Collection[str], dict[str, Any]], Collection[str]]
 
 
 def _accept(_tensors: Mapping[str, np.ndarray], _state: dict[str, Any]) -> None:
     """Accept any tensors and state."""
 
 
-class _Stored(Mapping[str, np.ndarray]):
+class Stored(Mapping[str, np.ndarray]):
     """The tensors of a file in the format safetensors, of which each is read when it is asked for, and not kept.
 
     The package's own functions map the file, so that all of it counts as memory of the process.
@@ -57,11 +56,19 @@ class _Stored(Mapping[str, np.ndarray]):
         self._entries = {former.get(name, name): entry for name, entry in header.items()}
 
     def __getitem__(self, name: str) -> np.ndarray:
+        return self.part(name, 0, None)
+
+    def part(self, name: str, first: int, last: int | None) -> np.ndarray:
+        """Return tensor[first:last] of the named tensor, without the other rows being read."""
         entry = self._entries[name]
-        dtype, shape, (first, last) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
-        if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != last - first or last > self._size:
+        dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
+        if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != end - begin or end > self._size:
             raise ValueError(f"{name} has another size")
-        self._file.seek(self._start + first)
+        if shape:
+            first, last, _ = slice(first, last).indices(shape[0])
+            begin += first * math.prod(shape[1:]) * dtype.itemsize
+            shape = (max(last - first, 0), *shape[1:])
+        self._file.seek(self._start + begin)
         values = np.empty(shape, dtype)
         if values.nbytes and self._file.readinto(values.data.cast("B")) != values.nbytes:
             raise ValueError(f"{name} is truncated")
@@ -75,6 +82,9 @@ class _Stored(Mapping[str, np.ndarray]):
 
     def __len__(self) -> int:
         return len(self._entries)
+
+
+Take = Callable[[Stored, dict[str, Any]], Tensors]
 
 
 def save_checkpoint(
@@ -138,7 +148,7 @@ def load_checkpoint(
     folder: Path,
     check: Check = _accept,
     former: Mapping[str, str] | None = None,
-    wanted: Wanted | None = None,
+    take: Take | None = None,
 ) -> tuple[Tensors, dict[str, Any], str | None] | None:
     """Read the latest complete checkpoint.
 
@@ -147,7 +157,7 @@ def load_checkpoint(
         check: Called with all tensors and the state as stored; raises ValueError, KeyError or TypeError if they are not
             those of a training.
         former: Names of tensors in files of older versions, and their present names.
-        wanted: Returns the names of the tensors to return, for the present names of all and the state. The others are
+        take: Returns the tensors to return, for all of them, by their present names, and the state. The others are
             checked one after another and not kept in memory. None: all.
 
     Returns:
@@ -164,16 +174,16 @@ def load_checkpoint(
             continue
         try:
             with open_regular(path) as file:
-                stored = _Stored(file, former or {})
+                stored = Stored(file, former or {})
                 state = stored.state
                 is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
                 tensors: Tensors = {}
                 if not is_other_version:
-                    if wanted is None:
+                    if take is None:
                         tensors = dict(stored)
                     check(tensors or stored, state)
-                    if wanted is not None:
-                        tensors = {key: stored[key] for key in wanted(list(stored), state)}
+                    if take is not None:
+                        tensors = take(stored, state)
         except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
             broken = path
             continue

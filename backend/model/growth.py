@@ -18,7 +18,7 @@ import torch
 
 from ..gpu.kernel import kernel
 from ..raster import devices
-from .anchors import Anchors, cell_keys, new_rows
+from .anchors import Anchors, cell_keys, kept_and_added, new_rows
 
 LEVELS = (16, 4, 1)
 """Edge lengths in voxels of the cells in which anchors are added, coarse to fine."""
@@ -101,8 +101,8 @@ class GrowthStatistics:
         """Return the statistics after a round of growth; the sums of what was seen too rarely are kept."""
 
         def follow(sums: torch.Tensor, count: torch.Tensor, width: int) -> torch.Tensor:
-            kept = torch.where(count < MIN_VISITS, sums, 0).view(-1, width)[growth.kept]
-            return torch.cat([kept, kept.new_zeros((growth.added, width))]).flatten()
+            rare = torch.where(count < MIN_VISITS, sums, 0).view(-1, width)
+            return kept_and_added(rare, growth.kept, rare.new_zeros((growth.added, width))).flatten()
 
         return GrowthStatistics(
             follow(self.gradient, self.visits, offsets), follow(self.visits, self.visits, offsets),
@@ -208,9 +208,9 @@ def grow_and_prune(
     kept = devices.upload(np.flatnonzero(~faint), anchors.rows)
     pruned = len(anchors) - len(kept)
     added_positions = devices.upload(np.concatenate(new_positions), anchors.rows)
-    anchors.positions = torch.cat([anchors.positions[kept], added_positions])
-    anchors.rows = torch.cat([anchors.rows[kept], devices.upload(rows, anchors.rows)])
-    anchors.ids = torch.cat([anchors.ids[kept], anchors.ids[parent]])
+    anchors.positions = kept_and_added(anchors.positions, kept, added_positions)
+    anchors.rows = kept_and_added(anchors.rows, kept, devices.upload(rows, anchors.rows))
+    anchors.ids = kept_and_added(anchors.ids, kept, anchors.ids[parent])
     return Growth(kept, len(child), pruned)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,8 @@ from ..model.growth import Growth, GrowthStatistics, grow_and_prune
 from ..model.object_model import ObjectModel
 from .cells.region import Region
 from .settings import GROW_FROM, GROW_UNTIL, Settings, growth_interval
+
+_PREFIX = "growth."
 
 
 class ViewStatistics(NamedTuple):
@@ -68,12 +71,30 @@ class ViewStatistics(NamedTuple):
 
 
 class GrowthStrategy:
-    """Accumulates statistics of the training views, and grows and prunes anchors at intervals."""
+    """Accumulates statistics of the training views, and grows and prunes anchors at intervals.
 
-    def __init__(self, settings: Settings, model: ObjectModel, region: Region) -> None:
+    Args:
+        settings: settings of the training.
+        model: the model.
+        region: the part of the model that is trained.
+        tensors: tensors of a checkpoint, of which the statistics are taken; on the CPU, they share their memory.
+    """
+
+    def __init__(
+        self, settings: Settings, model: ObjectModel, region: Region, tensors: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         self._settings = settings
         self._region = region
-        self.statistics = self._cleared(model)
+        self.statistics = (
+            self._cleared(model)
+            if tensors is None
+            else GrowthStatistics(
+                *(
+                    torch.from_numpy(tensors[_PREFIX + field.name]).to(model.device)
+                    for field in fields(GrowthStatistics)
+                )
+            )
+        )
 
     def observes(self, progress: float) -> bool:
         """Return whether statistics are accumulated at this progress, 0 .. 1; this starts before growth."""
@@ -109,6 +130,10 @@ class GrowthStrategy:
     def clear(self, model: ObjectModel) -> None:
         """Reset the statistics after the model's anchors were changed by other means."""
         self.statistics = self._cleared(model)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the statistics as tensors for a checkpoint."""
+        return {_PREFIX + field.name: getattr(self.statistics, field.name) for field in fields(GrowthStatistics)}
 
     @staticmethod
     def _cleared(model: ObjectModel) -> GrowthStatistics:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from ..model.anchors import Anchors
-from ..model.checkpoint import Wanted, load_checkpoint
-from ..model.growth import GrowthStatistics
+from ..model.checkpoint import Stored, Take, load_checkpoint
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..raster import devices
@@ -24,12 +23,17 @@ from ..shared.reconstruction.objects import LARGEST_ID
 from .budget import TrainingProgress
 from .cells.region import Region
 from .exposure.photo_colors import PhotoColors
+from .growth_strategy import GrowthStrategy
 from .optimizer.average import PREFIX, Average
 from .optimizer.head_adam import MOMENTS, STEP, HeadAdam, checkpoint_name
 from .optimizer.row_adam import RowAdam
 from .settings import HEAD_RATES, MODES, Settings
 
-_GROWTH = ("gradient", "visits", "opacity", "views")
+Keep = Callable[[Anchors], np.ndarray]
+"""Returns which of a block of anchors are kept, (n,) bool."""
+
+_BLOCK = 65536
+"""Number of anchors that are read at a time, if only some are kept."""
 
 Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
@@ -40,9 +44,9 @@ _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", 
 
 
 def read_checkpoint(
-    folder: Path, wanted: Wanted | None = None
+    folder: Path, take: Take | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None] | None:
-    """Read the latest complete checkpoint in `folder`; wanted: as in `load_checkpoint`.
+    """Read the latest complete checkpoint in `folder`; take: as in `load_checkpoint`.
 
     Returns:
         The tensors, the state, and a warning or None; None if there is no checkpoint.
@@ -51,7 +55,7 @@ def read_checkpoint(
         InputError: there are checkpoint files, but none can be read.
     """
     found = load_checkpoint(
-        folder, lambda tensors, state: _check_training(tensors, _renamed(state)), _FORMER_TENSORS, wanted
+        folder, lambda tensors, state: _check_training(tensors, _renamed(state)), _FORMER_TENSORS, take
     )
     if found is None:
         return None
@@ -70,7 +74,7 @@ def _renamed(state: dict[str, Any]) -> dict[str, Any]:
 def training_tensors(
     model: ObjectModel,
     row_optimizer: RowAdam,
-    statistics: GrowthStatistics,
+    growth: GrowthStrategy,
     average: Average,
     head_optimizer: HeadAdam,
     colors: PhotoColors | None,
@@ -82,7 +86,7 @@ def training_tensors(
         "anchors.rows": anchors.rows,
         "anchors.ids": anchors.ids,
         **row_optimizer.tensors(),
-        **{f"growth.{name}": getattr(statistics, name) for name in _GROWTH},
+        **growth.tensors(),
         "object_ids": model.classes.ids,
         "background": model.background,
         **average.tensors(),
@@ -124,11 +128,6 @@ def require_settings(wanted: Settings, state: dict[str, Any], folder: Path) -> N
         )
 
 
-def restore_statistics(tensors: dict[str, np.ndarray], device: torch.device) -> GrowthStatistics:
-    """Return the growth statistics in a checkpoint's tensors; on the CPU, they share their memory."""
-    return GrowthStatistics(*(torch.from_numpy(tensors[f"growth.{name}"]).to(device) for name in _GROWTH))
-
-
 def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any]) -> ObjectModel:
     """Return the model stored in a checkpoint's tensors and state; its anchors share their memory with the tensors."""
     settings = Settings(**state["settings"])
@@ -149,19 +148,23 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
 
 
 def require_checkpoint(
-    folder: Path, wanted: Wanted | None = None
+    folder: Path, take: Take | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Return the result of `read_checkpoint`; raise InputError also if there is no checkpoint."""
-    found = read_checkpoint(folder, wanted)
+    found = read_checkpoint(folder, take)
     if found is None:
         raise InputError(f"{folder} contains no checkpoint; train first.")
     return found
 
 
-def read_result(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
+def read_result(folder: Path, keep: Keep | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Read the result of a training from its checkpoint, without what only its continuation depends on.
 
     That takes a quarter of the memory of the whole checkpoint.
+
+    Args:
+        folder: The folder of the checkpoint.
+        keep: Chooses among a block of the anchors those that are kept in memory; None: all.
 
     Returns:
         The tensors, as in a checkpoint, of the mean of the model over the latest steps, the state, and a warning or
@@ -170,30 +173,50 @@ def read_result(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, Any], st
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    tensors, state, warning = require_checkpoint(folder, _of_result)
-    mean = {name.removeprefix(PREFIX): tensors.pop(name) for name in list(tensors) if name.startswith(PREFIX)}
-    if mean:
-        rows = mean.pop("rows")
-        if "anchors.rows" in tensors:
-            rows = np.concatenate([tensors["anchors.rows"][: Region.of(state).fixed], rows])
-        tensors |= {"anchors.rows": rows, **mean}
-    return tensors, state, warning
+    return require_checkpoint(folder, lambda stored, state: _take_result(stored, state, keep))
 
 
-def _of_result(names: Collection[str], state: dict[str, Any]) -> list[str]:
-    """Return the names of the tensors that `read_result` needs."""
-    left_out = {name.removeprefix(PREFIX) for name in names if name.startswith(PREFIX)}
-    if "rows" in left_out and not Region.of(state).fixed:
-        left_out.add("anchors.rows")
-    return [name for name in names if name not in left_out and not name.startswith(("adam.", "growth."))]
+def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None) -> dict[str, np.ndarray]:
+    """Return the tensors that `read_result` returns."""
+    mean = {name.removeprefix(PREFIX) for name in stored if name.startswith(PREFIX)}
+    others = [name for name in stored if not name.startswith(("adam.", "growth.", "anchors.", PREFIX))]
+    layout, voxel = Settings(**state["settings"]).layout, float(state["voxel"])
+    count = len(stored["anchors.ids"])
+    # Fixed anchors, the first ones, have no mean.
+    fixed = Region.of(state).fixed if "rows" in mean else count
+    size = count if keep is None else _BLOCK
+    blocks = []
+    for first in range(0, max(count, 1), max(size, 1)):
+        last = min(first + size, count)
+        positions, ids = (stored.part(f"anchors.{name}", first, last) for name in ("positions", "ids"))
+        rows = [stored.part("anchors.rows", first, min(last, fixed))] if first < fixed or not count else []
+        if last > fixed:
+            rows.append(stored.part(PREFIX + "rows", max(first - fixed, 0), last - fixed))
+        block = positions, _joined(rows), ids
+        if keep is not None:
+            kept = keep(Anchors(layout, voxel, *map(torch.from_numpy, block)))
+            block = block[0][kept], block[1][kept], block[2][kept]
+        blocks.append(block)
+    of_anchors = dict(zip(("positions", "rows", "ids"), map(_joined, zip(*blocks, strict=True)), strict=True))
+    return {
+        **{name: stored[PREFIX + name if name in mean else name] for name in others},
+        **{f"anchors.{name}": values for name, values in of_anchors.items()},
+    }
 
 
-def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[ObjectModel, dict[str, Any], str | None]:
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def load_model(
+    folder: Path, device: torch.device = devices.CPU, keep: Keep | None = None
+) -> tuple[ObjectModel, dict[str, Any], str | None]:
     """Load the result of a training, the mean of the model over the latest steps.
 
     Args:
         folder: The folder of the checkpoint.
         device: Where the model is to be.
+        keep: As in `read_result`.
 
     Returns:
         The model on `device`, the checkpoint's state, and a warning or None.
@@ -201,7 +224,7 @@ def load_model(folder: Path, device: torch.device = devices.CPU) -> tuple[Object
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    tensors, state, warning = read_result(folder)
+    tensors, state, warning = read_result(folder, keep)
     return model_from_checkpoint(tensors, state).to(device), state, warning
 
 

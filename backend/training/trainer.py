@@ -28,7 +28,6 @@ from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress
 from .cells.region import Region
 from .initial_model import DistantPoints, initial_model
-from .optimizer.average import Average
 from .optimizer.model_optimizer import ModelOptimizer
 from .processes.shared_views import Outcome, SharedViews
 from .processes.team import Order, Processes, Team
@@ -38,7 +37,6 @@ from .state import (
     model_from_checkpoint,
     read_checkpoint,
     require_settings,
-    restore_statistics,
     training_state,
     training_tensors,
 )
@@ -64,6 +62,7 @@ class Trainer:
         model: ObjectModel,
         rng: np.random.Generator,
         region: Region | None = None,
+        tensors: dict[str, np.ndarray] | None = None,
     ) -> None:
         self.scene = scene
         self.settings = settings
@@ -71,7 +70,7 @@ class Trainer:
         self.rng = rng
         self.progress = TrainingProgress()
         self.region = region or Region()
-        self.optimizer = ModelOptimizer(model, settings, self.region)
+        self.optimizer = ModelOptimizer(model, settings, self.region, tensors)
         self.view_step = ViewStep(
             scene, settings, model, self.optimizer.heads, self.optimizer.growth, self.optimizer.check,
             fits_colors=self.region.is_whole,
@@ -146,8 +145,7 @@ class Trainer:
         model, optimizer = self.model, self.optimizer
         self.progress.skipped += optimizer.check.take_skipped()
         tensors = training_tensors(
-            model, optimizer.rows, optimizer.growth.statistics, optimizer.average, optimizer.heads,
-            self.view_step.colors,
+            model, optimizer.rows, optimizer.growth, optimizer.average, optimizer.heads, self.view_step.colors,
         )  # fmt: skip
         state = training_state(
             self.settings, model, self.scene.supervise_background, self.rng, self.progress, self.region
@@ -208,13 +206,7 @@ class Trainer:
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]
-        region = Region.of(state)
-        trainer = cls(scene, settings, model.to(device), rng, region)
-        optimizer = trainer.optimizer
-        optimizer.rows.restore(tensors)
-        optimizer.growth.statistics = restore_statistics(tensors, device)
-        optimizer.heads.restore(tensors)
-        optimizer.average = Average.from_checkpoint(tensors, trainer.model, region.fixed)
+        trainer = cls(scene, settings, model.to(device), rng, Region.of(state), tensors)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
         return trainer

@@ -29,12 +29,14 @@ from backend.training.cells.parts import (
     begin_seams,
     join_cells,
     merged,
+    shown,
+    trained_in,
     without_anchors,
 )
 from backend.training.cells.region import EVERYWHERE, Region, inside
 from backend.training.cells.visibility import shares
 from backend.training.settings import GROW_UNTIL, Settings
-from backend.training.state import read_checkpoint, read_result
+from backend.training.state import model_from_checkpoint, read_checkpoint, read_result
 from backend.training.trainer import Trainer
 
 from .command_result import assert_rejected
@@ -98,6 +100,15 @@ def coarse_of(capture, ids, tmp_path, steps=40, **settings):
     return read_result(tmp_path / "coarse")[:2], trainer
 
 
+def needed_by(coarse, division, number, cell_of, cameras):
+    """Return the coarse model with the anchors that a cell needs, and the cells of those."""
+    tensors, state = coarse
+    every = model_from_checkpoint(tensors, state).anchors
+    kept = trained_in(division, number, tensors["anchors.positions"], cell_of) | shown(every, cameras)
+    of_cell = {name: value[kept] for name, value in tensors.items() if name.startswith("anchors.")}
+    return ({**tensors, **of_cell}, state), cell_of[kept]
+
+
 def in_two(coarse):
     """Divide a coarse model into two cells; returns the division and the cells of its anchors."""
     positions = coarse[0]["anchors.positions"]
@@ -106,12 +117,13 @@ def in_two(coarse):
 
 
 @pytest.mark.parametrize("mode", ["explicit", "view"])
-def test_cell_changes_its_own_anchors_only(tiny, tmp_path, mode):
+def test_cell_changes_its_own_anchors_only(tiny, tmp_path, mode, monkeypatch):
     capture, ids = tiny()
     coarse, whole = coarse_of(capture, ids, tmp_path, mode=mode, fit_colors=True)
     division, cell_of = in_two(coarse)
     cameras = [whole.scene.camera(i) for i in capture.train_indices]
-    tensors, state = begin_cell(coarse, division, 1, cell_of, cameras)
+    needed, of_needed = needed_by(coarse, division, 1, cell_of, cameras)
+    tensors, state = begin_cell(needed, division, 1, of_needed)
     before = {name: value.copy() for name, value in tensors.items()}
     trainer = Trainer.restore(capture, tensors, state, 500, devices.CPU, whole.scene.gains)
     fixed = trainer.region.fixed
@@ -131,7 +143,23 @@ def test_cell_changes_its_own_anchors_only(tiny, tmp_path, mode):
     again, warning = Trainer.resume(capture, tmp_path / "cell")
     assert warning is None and again.region == trainer.region
     assert torch.equal(again.shown.anchors.rows, trainer.shown.anchors.rows)
+    every = read_result(tmp_path / "cell")[0]
+    assert np.array_equal(every["anchors.rows"], again.shown.anchors.rows.numpy())
+    kept = np.arange(len(every["anchors.ids"])) % 3 == 0
+    monkeypatch.setattr("backend.training.state._BLOCK", 30)
+    some = read_result(tmp_path / "cell", lambda block: kept[[where(every, position) for position in block.positions]])[
+        0
+    ]
+    for name, value in every.items():
+        assert np.array_equal(some[name], value[kept] if name.startswith("anchors.") else value), name
+    none = read_result(tmp_path / "cell", lambda block: np.zeros(len(block), bool))[0]
+    assert none["anchors.rows"].shape == (0, every["anchors.rows"].shape[1])
     assert float(again.step(0.5)) == float(trainer.step(0.5)), "it goes on exactly as it would have"
+
+
+def where(tensors, position):
+    """Return the index of the anchor at a position."""
+    return np.flatnonzero((tensors["anchors.positions"] == position.numpy()).all(1))[0]
 
 
 def test_cell_learns_as_much_as_the_whole_model_where_it_is(tiny, tmp_path):
@@ -143,7 +171,9 @@ def test_cell_learns_as_much_as_the_whole_model_where_it_is(tiny, tmp_path):
     low = float(np.sort(positions[:, 0])[3])
     bounds = ((low, -np.inf, -np.inf), EVERYWHERE[1])
     division = Division("", 0.0, (Cell(bounds, bounds, len(positions) - 3),))
-    part = begin_cell(coarse, division, 0, division.cells_of(positions), [whole.scene.camera(i) for i in range(9)])
+    cameras = [whole.scene.camera(i) for i in range(9)]
+    needed, cell_of = needed_by(coarse, division, 0, division.cells_of(positions), cameras)
+    part = begin_cell(needed, division, 0, cell_of)
     trainer = Trainer.restore(capture, *part, 500, devices.CPU, whole.scene.gains)
     assert 0 < trainer.region.fixed <= 3
     losses = [np.mean([float(t.step(0.5)) for _ in range(60)][-20:]) for t in (trainer, whole)]
@@ -159,9 +189,13 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     expected = anchors_of(coarse)
     assert np.array_equal(expected["rows"], whole.shown.anchors.rows.numpy())
     assert not {name for name in coarse[0] if name.startswith(("adam.", "growth.", "mean."))}
-    cells = [begin_cell(coarse, division, number, cell_of, cameras) for number in range(2)]
+    cells = []
+    for number in range(2):
+        needed, of_needed = needed_by(coarse, division, number, cell_of, cameras)
+        cells.append(begin_cell(needed, division, number, of_needed))
     counts = [int((cell_of == number).sum()) for number in range(2)]
-    joined = join_cells(coarse, division, cell_of, cells, counts)
+    of_none = {name: value[cell_of == NO_CELL] for name, value in expected.items()}
+    joined = join_cells(of_none, division, cells, counts)
     coarse = without_anchors(coarse)
     assert not {name for name in coarse[0] if name.startswith("anchors.")}
     seams = begin_seams(coarse, division, joined, 5, cameras)
@@ -390,7 +424,7 @@ def test_folders_in_use_are_neither_read_nor_deleted(divided, run_command, monke
 
 def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tmp_path, run_command, monkeypatch):
     shutil.move(shutil.copytree(divided_once[0], tmp_path / "copy"), tmp_path / "moved")
-    coarse = []
+    coarse, kept, anchors = [], [], len(load_checkpoint(divided / "checkpoint")[0]["anchors.ids"])
 
     def watch(name):
         original = getattr(opening, name)
@@ -398,15 +432,16 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
         def wrapper(*arguments):
             found = original(*arguments)
             if name == "open_trained":
-                coarse.append(weakref.ref(found.model))
+                assert len(found.model.anchors) == 0
             elif arguments[0].name == "coarse":
+                kept.append(len(found[0]["anchors.ids"]))
                 coarse.extend(weakref.ref(value) for key, value in found[0].items() if key.startswith("anchors."))
             return found
 
         monkeypatch.setattr(opening, name, wrapper)
 
     def restore(cls, *arguments, original=Trainer.restore.__func__):
-        assert coarse and not [reference for reference in coarse if reference() is not None]
+        assert not [reference for reference in coarse if reference() is not None]
         coarse.clear()
         return original(cls, *arguments)
 
@@ -425,6 +460,7 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
     coarse.clear()
     assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
     assert run_command("merge", divided).code == EXIT_DONE and not coarse
+    assert kept[-1] < 0.1 * anchors < kept[0] <= anchors, "merging needs only the anchors that belong to no cell"
 
 
 def contents_of(place):

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from ...capture import Capture
+from ...model.anchors import Anchors
 from ...raster import Camera, devices
 from ...shared.errors import InputError
 from ...shared.formats.json_file import parse_json, read_json, write_json
@@ -33,7 +34,7 @@ from ...training.budget import TrainingProgress
 from ...training.cells.division import NO_CELL, Division, read_division
 from ...training.cells.parts import MERGED_OF, Checkpoint
 from ...training.scene import Scene
-from ...training.state import read_result
+from ...training.state import Keep, read_result
 from ..folder import open_trained, require_reconstruction, with_corrected_masks
 
 CHECKPOINT = "checkpoint"
@@ -93,10 +94,20 @@ class Divided:
     division: Division
     key: str
 
-    def read_coarse(self) -> tuple[Checkpoint, np.ndarray]:
-        """Read what parts are made of: the checkpoint of the coarse model, and the cell of each anchor, (N,)."""
-        coarse = read_part(self.folders.coarse)
-        return coarse, cells_of(self.division, self.scene, coarse[0]["anchors.positions"])
+    def read_coarse(self, keep: Callable[[Anchors, np.ndarray], np.ndarray]) -> tuple[Checkpoint, np.ndarray]:
+        """Read what parts are made of.
+
+        Args:
+            keep: returns which of a block of anchors, whose cells (n,) are given, are kept, (n,) bool.
+
+        Returns:
+            The checkpoint of the coarse model with the anchors that are kept, and their cells.
+        """
+        coarse = read_part(self.folders.coarse, lambda block: keep(block, self._cells_of(block.positions.numpy())))
+        return coarse, self._cells_of(coarse[0]["anchors.positions"])
+
+    def _cells_of(self, positions: np.ndarray) -> np.ndarray:
+        return cells_of(self.division, self.scene, positions)
 
     def cameras(self, names: Collection[str]) -> list[Camera]:
         """Return the cameras of the named views, in scene units."""
@@ -150,11 +161,15 @@ def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndar
     return np.where(near, division.cells_of(positions), NO_CELL)
 
 
-def read_part(folder: Path) -> Checkpoint:
-    """Return the model in a folder of cells/, as in its checkpoint; raise InputError if it is missing or damaged."""
+def read_part(folder: Path, keep: Keep | None = None) -> Checkpoint:
+    """Return the model in a folder of cells/, as in its checkpoint; keep: as in `read_result`.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
     damaged = InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
     try:
-        tensors, state, warning = read_result(folder)
+        tensors, state, warning = read_result(folder, keep)
     except InputError as error:
         raise damaged from error
     if warning:

@@ -17,7 +17,7 @@ from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.cells.division import NO_CELL
-from ...training.cells.parts import Checkpoint, begin_seams, join_cells, merged, without_anchors
+from ...training.cells.parts import Checkpoint, anchors_of, begin_seams, join_cells, merged, without_anchors
 from ...training.state import load_model
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
@@ -65,11 +65,12 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             reporter.begin(_JOIN, f"Joining {len(cells)} cells")
             parts = [divided.folders.cell(number) / CHECKPOINT for number in range(len(cells))]
             counts = [cell.anchors for cell in cells]
-            coarse, cell_of = divided.read_coarse()
-            joined = join_cells(coarse, divided.division, cell_of, map(read_part, parts), counts)
+            coarse, _ = divided.read_coarse(lambda _, cell_of: cell_of == NO_CELL)
+            of_none, shared = anchors_of(coarse), without_anchors(coarse)
+            joined = join_cells(of_none, divided.division, map(read_part, parts), counts)
             of = (divided.key, *map(digest_of, parts))
-        surroundings, shared = int((cell_of == NO_CELL).sum()), without_anchors(coarse)
-        del coarse
+        surroundings = len(of_none["ids"])
+        del coarse, of_none
         steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
         reporter.expect({KERNELS: ("Preparing", kernel_seconds(device))})
         ensure_kernels(reporter, device)

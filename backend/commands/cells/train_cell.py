@@ -6,13 +6,16 @@ import argparse
 import shutil
 from dataclasses import replace
 
+import numpy as np
+
+from ...model.anchors import Anchors
 from ...model.checkpoint import has_checkpoint
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget
-from ...training.cells.parts import Checkpoint, begin_cell
+from ...training.cells.parts import Checkpoint, begin_cell, shown, trained_in
 from ...training.cells.region import inside
 from ...training.trainer import Trainer
 from ..folder import READ, memory_for_targets
@@ -97,9 +100,15 @@ def _open(divided: Divided, number: int, options: argparse.Namespace, reporter: 
 
 
 def _begin(divided: Divided, number: int) -> Checkpoint:
-    """Return the checkpoint with which a cell begins; the coarse model is no longer in memory then."""
-    coarse, cell_of = divided.read_coarse()
-    return begin_cell(coarse, divided.division, number, cell_of, divided.cameras(divided.division.cells[number].views))
+    """Return the checkpoint with which a cell begins."""
+    division = divided.division
+    cameras = divided.cameras(division.cells[number].views)
+
+    def is_needed(anchors: Anchors, cell_of: np.ndarray) -> np.ndarray:
+        return trained_in(division, number, anchors.positions.numpy(), cell_of) | shown(anchors, cameras)
+
+    coarse, cell_of = divided.read_coarse(is_needed)
+    return begin_cell(coarse, division, number, cell_of)
 
 
 def _trained(trainer: Trainer) -> int:

@@ -44,28 +44,29 @@ def without_anchors(coarse: Checkpoint) -> Checkpoint:
     return {name: value for name, value in coarse[0].items() if not name.startswith("anchors.")}, coarse[1]
 
 
+def shown(anchors: Anchors, cameras: Iterable[Camera]) -> np.ndarray:
+    """Return which of the anchors, on the CPU, any of the cameras shows: (N,) bool."""
+    found = np.zeros(len(anchors), np.bool_)
+    for camera in cameras:
+        found[anchors_in_view(anchors, *frustum(camera)).numpy()] = True
+    return found
+
+
 def begin_part(
-    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, cameras: Iterable[Camera],
-    seed: Sequence[int],
-) -> Checkpoint:  # fmt: skip
+    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, seed: Sequence[int]
+) -> Checkpoint:
     """Return the checkpoint from which a part of a model is trained.
 
     Args:
         shared: checkpoint of the coarse model, of whose anchors nothing is used.
-        anchors: anchors of the whole model, as from `anchors_of`.
-        trained: (N,) bool, those of the part.
+        anchors: the anchors of the part and those around it, as from `anchors_of`.
+        trained: (n,) bool, those of the part.
         bounds: where anchors may be added.
-        cameras: the views of the part, in scene units; other anchors that none of them shows are left out.
         seed: of the random numbers.
     """
     tensors, state = shared
     settings = Settings(**state["settings"])
-    of_anchors = (torch.from_numpy(np.ascontiguousarray(anchors[name])) for name in _OF_ANCHORS)
-    every = Anchors(settings.layout, float(state["voxel"]), *of_anchors)
-    seen = np.zeros(len(every), np.bool_)
-    for camera in cameras:
-        seen[anchors_in_view(every, *frustum(camera)).numpy()] = True
-    order = np.concatenate([np.flatnonzero(seen & ~trained), np.flatnonzero(trained)])
+    order = np.concatenate([np.flatnonzero(~trained), np.flatnonzero(trained)])
     fixed = len(order) - int(trained.sum())
     made = _untrained(tensors, {name: anchors[name][order] for name in _OF_ANCHORS}, fixed, settings)
     rng = np.random.default_rng([settings.seed, *seed])
@@ -75,31 +76,32 @@ def begin_part(
     }  # fmt: skip
 
 
-def begin_cell(
-    shared: Checkpoint, division: Division, number: int, cell_of: np.ndarray, cameras: Iterable[Camera]
-) -> Checkpoint:
+def trained_in(division: Division, number: int, positions: np.ndarray, cell_of: np.ndarray) -> np.ndarray:
+    """Return which anchors of the coarse model at `positions` (N, 3), in the cells (N,), a cell trains: (N,) bool."""
+    return inside(positions, division.cells[number].bounds) & (cell_of != NO_CELL)
+
+
+def begin_cell(coarse: Checkpoint, division: Division, number: int, cell_of: np.ndarray) -> Checkpoint:
     """Return the checkpoint from which a cell is trained.
 
     Args:
-        shared: checkpoint of the coarse model.
+        coarse: checkpoint of the coarse model, with the anchors that the cell trains or that its views show.
         division, number: the cells, and which of them.
-        cell_of: (N,) the cell of each anchor of the coarse model.
-        cameras: the cell's training views, in scene units.
+        cell_of: (n,) the cell of each of these anchors.
     """
-    anchors, bounds = anchors_of(shared), division.cells[number].bounds
-    trained = inside(anchors["positions"], bounds) & (cell_of != NO_CELL)
-    return begin_part(shared, anchors, trained, bounds, cameras, (number,))
+    anchors = anchors_of(coarse)
+    trained = trained_in(division, number, anchors["positions"], cell_of)
+    return begin_part(coarse, anchors, trained, division.cells[number].bounds, (number,))
 
 
 def join_cells(
-    shared: Checkpoint, division: Division, cell_of: np.ndarray, cells: Iterable[Checkpoint], counts: Sequence[int]
+    of_none: dict[str, np.ndarray], division: Division, cells: Iterable[Checkpoint], counts: Sequence[int]
 ) -> dict[str, np.ndarray]:
     """Return the anchors of the coarse model that belong to no cell, followed by those in the cores of trained cells.
 
     Args:
-        shared: checkpoint of the coarse model.
+        of_none: these anchors of the coarse model, as from `anchors_of`.
         division: the cells.
-        cell_of: (N,) the cell of each anchor of the coarse model.
         cells: checkpoint of each cell, read one after another.
         counts: number of anchors in the core of each cell.
 
@@ -109,7 +111,6 @@ def join_cells(
     Raises:
         InputError: a cell has another number of anchors.
     """
-    of_none = {name: values[cell_of == NO_CELL] for name, values in anchors_of(shared).items()}
     end = len(of_none["ids"])
     joined = {name: np.empty((end + sum(counts), *values.shape[1:]), values.dtype) for name, values in of_none.items()}
     for name, values in of_none.items():
@@ -139,9 +140,12 @@ def begin_seams(
         surroundings: number of the first of them that belong to no cell.
         cameras: the training views that show seams, in scene units.
     """
-    return begin_part(
-        shared, anchors, _on_seams(division, anchors, surroundings), NOWHERE, cameras, (len(division.cells),)
-    )
+    trained = _on_seams(division, anchors, surroundings)
+    settings, voxel = Settings(**shared[1]["settings"]), float(shared[1]["voxel"])
+    every = Anchors(settings.layout, voxel, *(torch.from_numpy(anchors[name]) for name in _OF_ANCHORS))
+    needed = trained | shown(every, cameras)
+    of_part = {name: values[needed] for name, values in anchors.items()}
+    return begin_part(shared, of_part, trained[needed], NOWHERE, (len(division.cells),))
 
 
 def merged(

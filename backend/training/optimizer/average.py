@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from ...model.anchors import kept_and_added
+
 if TYPE_CHECKING:
     from ...model.object_model import ObjectModel
 
@@ -57,10 +59,10 @@ class Average:
         """Apply a change of the anchors.
 
         Args:
-            kept: mask or indices of the rows that are kept, not counting those of fixed anchors.
-            new: (n, columns), rows that are appended.
+            kept: (n,) int64, indices of the rows that are kept, not counting those of fixed anchors.
+            new: (m, columns), rows that are appended.
         """
-        self._rows = torch.cat([self._rows[kept], new])
+        self._rows = kept_and_added(self._rows, kept, new)
 
     def of(self, model: ObjectModel) -> ObjectModel:
         """Return the mean as a model; `model` is the model in training."""
@@ -78,7 +80,7 @@ class Average:
     def from_checkpoint(cls, tensors: Mapping[str, np.ndarray], model: ObjectModel, fixed: int = 0) -> Average:
         """Restore the mean from a checkpoint's tensors, on the device of `model`; `fixed` as for the class.
 
-        For checkpoints of versions without a mean, it is initialized with `model`.
+        For checkpoints without a mean, it is initialized with `model`.
         """
         found = {name.removeprefix(PREFIX): value for name, value in tensors.items() if name.startswith(PREFIX)}
         if not found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,7 @@ class ModelOptimizer:
         model: the model, which is changed in place.
         settings: settings of the training.
         region: the part of the model that is trained.
+        tensors: tensors of a checkpoint, from which the training goes on; None at its start.
 
     Attributes:
         rows, heads: Adam of the anchors' rows, and of the heads and the background.
@@ -35,18 +37,21 @@ class ModelOptimizer:
         check: counts updates that are not finite.
     """
 
-    def __init__(self, model: ObjectModel, settings: Settings, region: Region) -> None:
+    def __init__(
+        self, model: ObjectModel, settings: Settings, region: Region, tensors: Mapping[str, np.ndarray] | None = None
+    ) -> None:
         self._model = model
         self._settings = settings
         self._region = region
-        self.rows = RowAdam(model.anchors.rows, region.fixed)
-        self.average = Average(model, region.fixed)
+        self.rows = RowAdam(model.anchors.rows, region.fixed, tensors)
+        self.average = Average.from_checkpoint(tensors or {}, model, region.fixed)
         model.background.requires_grad_(settings.background == "learned" and region.is_whole)
         model.heads.requires_grad_(region.is_whole)
         names = [name for name in HEAD_RATES if name != "background"]
         heads = {name: list(getattr(model.heads, name).parameters()) for name in names}
         self.heads = HeadAdam({**heads, "background": [model.background]})
-        self.growth = GrowthStrategy(settings, model, region)
+        self.heads.restore(tensors or {})
+        self.growth = GrowthStrategy(settings, model, region, tensors)
         self.check = FiniteCheck(model.device)
 
     def update(self, gradients: ViewGradients, progress: float, step: int) -> None:
@@ -107,7 +112,7 @@ class ModelOptimizer:
         # Those were finite before the training, and are none of its business.
         kept[:fixed] = True
         a.positions, a.rows, a.ids = a.positions[kept], a.rows[kept], a.ids[kept]
-        kept = kept[fixed:]
+        kept = kept[fixed:].nonzero()[:, 0]
         self.rows.take(kept, 0)
         self.average.take(kept, a.rows[:0])
         self.growth.clear(self._model)

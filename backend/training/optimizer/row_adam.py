@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
+from ...model.anchors import kept_and_added
 from ...raster import devices
 from .adam import BETA1, BETA2, EPSILON, step_rows
 
@@ -19,15 +20,18 @@ class RowAdam:
     Args:
         rows: (N, columns) float32.
         fixed: number of rows, the first ones, that are not trained and have no moments.
+        tensors: tensors of a checkpoint, of which the moments are taken; on the CPU, they share their memory.
 
     Attributes:
         exp_avg, exp_avg_sq: (N - fixed, columns) float32.
     """
 
-    def __init__(self, rows: torch.Tensor, fixed: int) -> None:
+    def __init__(self, rows: torch.Tensor, fixed: int, tensors: Mapping[str, np.ndarray] | None = None) -> None:
         self._fixed = fixed
-        self.exp_avg = torch.zeros_like(rows[fixed:])
-        self.exp_avg_sq = torch.zeros_like(self.exp_avg)
+        self.exp_avg, self.exp_avg_sq = (
+            torch.zeros_like(rows[fixed:]) if tensors is None else torch.from_numpy(tensors[name]).to(rows.device)
+            for name in (_PREFIX + "exp_avg", _PREFIX + "exp_avg_sq")
+        )
 
     def step(
         self,
@@ -81,19 +85,13 @@ class RowAdam:
         """Apply a change of the anchors.
 
         Args:
-            kept: mask or indices of the rows that are kept, not counting fixed ones.
+            kept: (n,) int64, indices of the rows that are kept, not counting fixed ones.
             added: number of rows that are appended.
         """
         for name in ("exp_avg", "exp_avg_sq"):
-            moments = getattr(self, name)[kept]
-            setattr(self, name, torch.cat([moments, moments.new_zeros((added, moments.shape[1]))]))
+            moments = getattr(self, name)
+            setattr(self, name, kept_and_added(moments, kept, moments.new_zeros((added, moments.shape[1]))))
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the moments as tensors for a checkpoint."""
         return {f"{_PREFIX}exp_avg": self.exp_avg, f"{_PREFIX}exp_avg_sq": self.exp_avg_sq}
-
-    def restore(self, tensors: Mapping[str, np.ndarray]) -> None:
-        """Take the moments of a checkpoint's tensors; on the CPU, they share their memory."""
-        device = self.exp_avg.device
-        self.exp_avg = torch.from_numpy(tensors[f"{_PREFIX}exp_avg"]).to(device)
-        self.exp_avg_sq = torch.from_numpy(tensors[f"{_PREFIX}exp_avg_sq"]).to(device)
