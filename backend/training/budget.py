@@ -52,7 +52,7 @@ class TrainingProgress:
     """The progress of a training; saved with each checkpoint.
 
     Attributes:
-        last_growth: step of the latest growth.
+        last_growth: step from which the interval to the next growth is counted.
         skipped: number of updates that were not finite.
         faults: number of steps for each known cause of such updates.
         queue: remaining views of this pass over the training views.

@@ -113,8 +113,21 @@ class GrowthStrategy:
         )
 
     def is_due(self, progress: float, step: int, last_growth: int) -> bool:
-        """Return whether growth is due after `step`; last_growth: the step of the latest growth."""
+        """Return whether growth is due after `step`; last_growth: as from `counted_from`."""
         return progress >= GROW_FROM and step - last_growth >= growth_interval(step)
+
+    def counted_from(self, step: int, last_growth: int, views: int) -> int:
+        """Return the step from which the interval to the next growth is counted, after a growth at `step`.
+
+        It is the step at which the growth was due, since several steps that are made together may go past it.
+
+        Args:
+            step: number of steps so far.
+            last_growth: the step from which the interval to this growth was counted.
+            views: number of steps that are made together.
+        """
+        late = step - last_growth - growth_interval(step)
+        return step - late if late < views else step
 
     def grow(self, model: ObjectModel, rng: np.random.Generator) -> Growth:
         """Grow and prune the model's anchors in place, based on the accumulated statistics."""

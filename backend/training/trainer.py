@@ -393,10 +393,11 @@ class Trainer:
                     self.optimizer.expected_changes, count=team.rank, progress=progress, step=p.step
                 )
             self.view_step.expect(p.queue[::-1][team.rank :: team.size], progress)
-            gradients = self.view_step.compute(
-                p.queue[-1 - team.rank], progress, overfitting.dropout_at(p, progress, step),
-                alone=step % ALONE_EVERY == 0,
-            )  # fmt: skip
+            with self.optimizer.heads_ahead(team.rank, progress):
+                gradients = self.view_step.compute(
+                    p.queue[-1 - team.rank], progress, overfitting.dropout_at(p, progress, step),
+                    alone=step % ALONE_EVERY == 0,
+                )  # fmt: skip
         except (InputError, OSError) as error:
             return Outcome(None, None), error
         return Outcome(gradients, self.optimizer.check.take_fault() if gradients is None else None), None
@@ -419,7 +420,7 @@ class Trainer:
             if gradients.statistics is not None:
                 growth.observe(gradients.statistics, self.settings.offsets, gradients.size)
         if growth.is_due(progress, p.step, p.last_growth):
-            p.last_growth = p.step
+            p.last_growth = growth.counted_from(p.step, p.last_growth, self._team.size)
             self.optimizer.grow(self.rng)
 
     def follow(self, team: Processes) -> None:

@@ -117,3 +117,49 @@ assert "torch._dynamo" not in sys.modules
 """
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_parameters_are_ahead_only_within_the_context():
+    groups = parameters()
+    optimizer = HeadAdam(groups)
+    start = [parameter.detach().clone() for group in groups.values() for parameter in group]
+
+    def values():
+        return [parameter.detach().clone() for group in groups.values() for parameter in group]
+
+    with optimizer.ahead(3, rates(0)):
+        assert all(map(torch.equal, values(), start)), "nothing is expected before the first step"
+    constant = {name: [torch.randn(p.shape) for p in group] for name, group in groups.items()}
+
+    def step(count):
+        for _ in range(count):
+            for name, group in groups.items():
+                for parameter, gradient in zip(group, constant[name], strict=True):
+                    parameter.grad = gradient.clone()
+            optimizer.step(rates(0))
+
+    step(5)
+    before = values()
+    found = []
+
+    def fail():
+        with optimizer.ahead(3, rates(0)):
+            found.extend(values())
+            raise ValueError
+
+    with pytest.raises(ValueError):
+        fail()
+    assert all(map(torch.equal, values(), before))
+    step(3)
+    for a, b, c in zip(found, values(), before, strict=True):
+        assert not torch.equal(a, c)
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
+
+
+def test_skipped_first_step_is_no_reason_to_expect_a_change():
+    groups = parameters()
+    optimizer = HeadAdam(groups)
+    before = stepped(optimizer, groups, range(1), skipping=(0,))
+    with optimizer.ahead(2, rates(0)):
+        found = [parameter.detach().clone() for group in groups.values() for parameter in group]
+    assert all(map(torch.equal, found, before))

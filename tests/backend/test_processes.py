@@ -72,6 +72,22 @@ def start(command: list, count: int, **options) -> list[subprocess.Popen]:
     ]  # fmt: skip
 
 
+def test_growth_is_as_frequent_with_several_views_a_step(tiny):
+    capture, ids = tiny()
+    growth = Trainer.start(capture, ids, Settings(offsets=2)).optimizer.growth
+    rounds = {}
+    for views in (1, 4, 7):
+        last, rounds[views] = 0, []
+        for step in range(views, 4000, views):
+            if growth.is_due(step / 4000, step, last):
+                last = growth.counted_from(step, last, views)
+                rounds[views].append(step)
+    due = np.array(rounds[1])
+    assert np.diff(due).min() >= 25 and len(due) > 80
+    for views in (4, 7):
+        assert abs(len(rounds[views]) - len(due)) <= 2
+
+
 def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
     """Wait for processes; returns exit code, output and errors of each."""
     found = []

@@ -5,7 +5,8 @@ The computation is torch's; its class `torch.optim.Adam` would first import torc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -61,6 +62,27 @@ class HeadAdam:
     def gradients(self, gradients: Sequence[torch.Tensor | None]) -> None:
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
+
+    @contextmanager
+    def ahead(self, count: int, rates: Mapping[str, float]) -> Iterator[None]:
+        """Let the parameters be, within the context, where they are expected after further steps, by their moments.
+
+        Args:
+            count: number of steps.
+            rates: The learning rate of each group.
+        """
+        before = [parameter.detach().clone() for parameter in self._parameters]
+        with torch.no_grad():
+            for name, numbers in self._numbers.items():
+                for i in numbers:
+                    if i in self._states:
+                        self._parameters[i].sub_(self._direction(self._states[i]), alpha=count * rates[name])
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                for parameter, value in zip(self._parameters, before, strict=True):
+                    parameter.copy_(value)
 
     @torch.no_grad()
     def step(self, rates: Mapping[str, float], finite: torch.Tensor | None = None) -> torch.Tensor:
@@ -124,6 +146,13 @@ class HeadAdam:
             len(stepped) * _BLOCKS, _THREADS, rows, usable
         )
         return usable
+
+    @staticmethod
+    def _direction(state: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return the change of a parameter in a step of Adam, for a learning rate of -1."""
+        # Of a parameter that was never updated, everything is 0.
+        correction1, correction2 = ((1 - beta ** state[STEP]).clamp(min=EPSILON) for beta in (BETA1, BETA2))
+        return (state["exp_avg"] / correction1).div_((state["exp_avg_sq"] / correction2).sqrt_().add_(EPSILON))
 
     def _state(self, number: int) -> dict[str, torch.Tensor]:
         if number not in self._states:

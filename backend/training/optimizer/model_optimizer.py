@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -94,6 +95,12 @@ class ModelOptimizer:
             (n, columns).
         """
         return count * self.rows.expected_change(seen, row_rates(self._settings, progress), step)
+
+    def heads_ahead(self, count: int, progress: float) -> AbstractContextManager[None]:
+        """Let the heads be where they are expected in `count` steps; see `expected_changes`."""
+        if not count:
+            return nullcontext()
+        return self.heads.ahead(count, {name: rate(HEAD_RATES[name], progress) for name in self.heads.groups})
 
     def _gradients_of_heads(self) -> dict[str, list[torch.Tensor]]:
         return {
