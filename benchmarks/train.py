@@ -76,6 +76,7 @@ def measure(trainer: Trainer, steps: int) -> dict:
     from backend.model.generate_on_cpu import Generate
     from backend.raster import _Rasterize
     from backend.training.losses.on_cpu import _ImageLoss
+    from backend.training.optimizer.model_optimizer import ModelOptimizer
 
     watch = Stopwatch()
     watch.wrap(step, "rasterize", "raster")
@@ -84,7 +85,7 @@ def measure(trainer: Trainer, steps: int) -> dict:
     watch.wrap(_ImageLoss, "backward", "loss")
     watch.wrap(step, "generate", "heads")
     watch.wrap(Generate, "backward", "heads")
-    watch.wrap(Trainer, "_update", "optimizer")
+    watch.wrap(ModelOptimizer, "update", "optimizer")
     # The backward pass of the heads' layers is the time of autograd outside the functions above.
     whole = {"seconds": 0.0}
     inner = torch.Tensor.backward

@@ -58,12 +58,18 @@ class Stored(Mapping[str, np.ndarray]):
     def __getitem__(self, name: str) -> np.ndarray:
         return self.part(name, 0, None)
 
-    def part(self, name: str, first: int, last: int | None) -> np.ndarray:
-        """Return tensor[first:last] of the named tensor, without the other rows being read."""
+    def kind(self, name: str) -> tuple[np.dtype[Any], tuple[int, ...]]:
+        """Return type and shape of the named tensor."""
         entry = self._entries[name]
         dtype, shape, (begin, end) = _DTYPES[entry["dtype"]], tuple(entry["shape"]), entry["data_offsets"]
         if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != end - begin or end > self._size:
             raise ValueError(f"{name} has another size")
+        return dtype, shape
+
+    def part(self, name: str, first: int, last: int | None) -> np.ndarray:
+        """Return tensor[first:last] of the named tensor, without the other rows being read."""
+        dtype, shape = self.kind(name)
+        begin = self._entries[name]["data_offsets"][0]
         if shape:
             first, last, _ = slice(first, last).indices(shape[0])
             begin += first * math.prod(shape[1:]) * dtype.itemsize
@@ -157,8 +163,9 @@ def load_checkpoint(
         check: Called with all tensors and the state as stored; raises ValueError, KeyError or TypeError if they are not
             those of a training.
         former: Names of tensors in files of older versions, and their present names.
-        take: Returns the tensors to return, for all of them, by their present names, and the state. The others are
-            checked one after another and not kept in memory. None: all.
+        take: Returns the tensors to return, for all of them, by their present names, and the state as stored. With
+            it, tensors are checked one after another, and those that it does not return are not kept in memory. Its
+            errors are not those of a damaged file. None: all.
 
     Returns:
         The tensors by name, the state, and a warning or None if the checkpoint is not the latest one that was written;
@@ -173,22 +180,27 @@ def load_checkpoint(
         if not path.exists():
             continue
         try:
-            with open_regular(path) as file:
+            file = open_regular(path)
+        except OSError:
+            broken = path
+            continue
+        with file:
+            tensors: Tensors = {}
+            try:
                 stored = Stored(file, former or {})
                 state = stored.state
                 is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
-                tensors: Tensors = {}
                 if not is_other_version:
                     if take is None:
                         tensors = dict(stored)
                     check(tensors or stored, state)
-                    if take is not None:
-                        tensors = take(stored, state)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
-            broken = path
-            continue
-        if is_other_version:
-            raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
+            except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError):
+                broken = path
+                continue
+            if is_other_version:
+                raise InputError(f"{path} was written by another version of ObjectGS; train again with --restart.")
+            if take is not None:
+                tensors = take(stored, state)
         warning = None
         if broken is not None:
             warning = f"{broken} is truncated or damaged; continuing from the previous checkpoint ({path.name})."

@@ -119,7 +119,8 @@ class GrowthStrategy:
     def counted_from(self, step: int, last_growth: int, views: int) -> int:
         """Return the step from which the interval to the next growth is counted, after a growth at `step`.
 
-        It is the step at which the growth was due, since several steps that are made together may go past it.
+        It is the step at which the growth was due, since several steps that are made together may go past it; `step`
+        itself, if growth was put off for other reasons.
 
         Args:
             step: number of steps so far.

@@ -33,7 +33,7 @@ Keep = Callable[[Anchors], np.ndarray]
 """Returns which of a block of anchors are kept, (n,) bool."""
 
 _BLOCK = 65536
-"""Number of anchors that are read at a time, if only some are kept."""
+"""Number of anchors, or rows of a tensor, that are read at a time where not all are kept."""
 
 Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
@@ -300,15 +300,19 @@ def _check_state(settings: Settings, state: dict[str, Any]) -> None:
 
 def _check_tensors(tensors: Mapping[str, np.ndarray], expected: Expected) -> None:
     for name, (dtype, shape) in expected.items():
-        # Not assigned here, so that no tensor is kept in memory until the next one is read.
-        _check_tensor(name, tensors[name], dtype, shape)
+        kind = tensors.kind(name) if isinstance(tensors, Stored) else (tensors[name].dtype, tensors[name].shape)
+        if kind != (dtype, shape):
+            raise ValueError(f"{name} is {kind[0]} {kind[1]}, expected {np.dtype(dtype)} {shape}")
+        if np.dtype(dtype).kind == "f" and not _is_finite(tensors, name, shape[0]):
+            raise ValueError(f"{name} is not finite")
 
 
-def _check_tensor(name: str, tensor: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
-    if tensor.dtype != dtype or tensor.shape != shape:
-        raise ValueError(f"{name} is {tensor.dtype} {tensor.shape}, expected {np.dtype(dtype)} {shape}")
-    if tensor.dtype.kind == "f" and not np.isfinite(tensor).all():
-        raise ValueError(f"{name} is not finite")
+def _is_finite(tensors: Mapping[str, np.ndarray], name: str, length: int) -> bool:
+    """Return whether all values of a tensor with this number of rows are finite; of a file, blocks are read."""
+    if not isinstance(tensors, Stored):
+        return bool(np.isfinite(tensors[name]).all())
+    blocks = (tensors.part(name, first, first + _BLOCK) for first in range(0, length, _BLOCK))
+    return all(np.isfinite(block).all() for block in blocks)
 
 
 def _check_head_moments(tensors: Mapping[str, np.ndarray], shapes: Sequence[tuple[int, ...]]) -> None:

@@ -206,6 +206,8 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     for name, values in expected.items():
         assert np.array_equal(tensors[f"anchors.{name}"][order], values[wanted]), name
     save_checkpoint(tmp_path / "merged", tensors, state)
+    first = read_result(tmp_path / "merged", lambda block: np.arange(len(block)) < 3)[0]
+    assert np.array_equal(first["anchors.rows"], tensors["anchors.rows"][:3]), "there is no mean"
     again = Trainer.resume(capture, tmp_path / "merged")[0]
     assert again.region.is_whole and np.isfinite(float(again.step(GROW_UNTIL)))
 

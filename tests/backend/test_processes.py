@@ -88,6 +88,32 @@ def test_growth_is_as_frequent_with_several_views_a_step(tiny):
         assert abs(len(rounds[views]) - len(due)) <= 2
 
 
+def test_late_views_are_computed_at_the_expected_heads(tiny, monkeypatch):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, Settings(offsets=2))
+    for step in range(20):
+        trainer.step(step / 40)
+
+    def heads():
+        return torch.cat([value.detach().flatten() for value in trainer.optimizer.heads.parameters])
+
+    team, used = Team(), []
+    team.rank, team.size = 2, 3
+    trainer.work_with(team)
+    trainer.progress.queue = list(capture.train_indices)
+    monkeypatch.setattr(trainer.view_step, "compute", lambda *_, **__: used.append(heads()))
+    before = heads()
+    trainer._compute(0.5)
+    assert torch.equal(heads(), before) and not torch.equal(used[0], before)
+    with trainer.optimizer.heads_ahead(2, 0.5):
+        assert torch.equal(heads(), used[0])
+
+    team.size = 4
+    trainer.progress.step, trainer.progress.last_growth = 103, 75
+    trainer._grow([], 0.5)
+    assert trainer.progress.last_growth == 100, "growth was due three steps before"
+
+
 def ended(processes: list[subprocess.Popen]) -> list[tuple[int, str, str]]:
     """Wait for processes; returns exit code, output and errors of each."""
     found = []

@@ -416,6 +416,12 @@ def test_tensors_are_those_that_were_written(tmp_path):
     for name, values in of_package.items():
         read = tensors[{"former": "present"}.get(name, name)]
         assert read.dtype == values.dtype and np.array_equal(read, values) and np.array_equal(read, written[name])
+
+    def fail(*_):
+        raise ValueError("of the caller")
+
+    with pytest.raises(ValueError, match="of the caller"):
+        load_checkpoint(tmp_path, take=fail)
     only_x = load_checkpoint(tmp_path, take=lambda stored, state: {"x": stored["x"]})[0]
     assert set(only_x) == {"x"}
 

@@ -53,20 +53,22 @@ def shown(anchors: Anchors, cameras: Iterable[Camera]) -> np.ndarray:
 
 
 def begin_part(
-    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, seed: Sequence[int]
-) -> Checkpoint:
+    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, around: np.ndarray, bounds: Bounds,
+    seed: Sequence[int],
+) -> Checkpoint:  # fmt: skip
     """Return the checkpoint from which a part of a model is trained.
 
     Args:
         shared: checkpoint of the coarse model, of whose anchors nothing is used.
-        anchors: the anchors of the part and those around it, as from `anchors_of`.
+        anchors: anchors, as from `anchors_of`.
         trained: (n,) bool, those of the part.
+        around: (n,) bool, those that its views show; unless they are trained, they stay fixed. Others are left out.
         bounds: where anchors may be added.
         seed: of the random numbers.
     """
     tensors, state = shared
     settings = Settings(**state["settings"])
-    order = np.concatenate([np.flatnonzero(~trained), np.flatnonzero(trained)])
+    order = np.concatenate([np.flatnonzero(around & ~trained), np.flatnonzero(trained)])
     fixed = len(order) - int(trained.sum())
     made = _untrained(tensors, {name: anchors[name][order] for name in _OF_ANCHORS}, fixed, settings)
     rng = np.random.default_rng([settings.seed, *seed])
@@ -91,7 +93,7 @@ def begin_cell(coarse: Checkpoint, division: Division, number: int, cell_of: np.
     """
     anchors = anchors_of(coarse)
     trained = trained_in(division, number, anchors["positions"], cell_of)
-    return begin_part(coarse, anchors, trained, division.cells[number].bounds, (number,))
+    return begin_part(coarse, anchors, trained, ~trained, division.cells[number].bounds, (number,))
 
 
 def join_cells(
@@ -143,9 +145,7 @@ def begin_seams(
     trained = _on_seams(division, anchors, surroundings)
     settings, voxel = Settings(**shared[1]["settings"]), float(shared[1]["voxel"])
     every = Anchors(settings.layout, voxel, *(torch.from_numpy(anchors[name]) for name in _OF_ANCHORS))
-    needed = trained | shown(every, cameras)
-    of_part = {name: values[needed] for name, values in anchors.items()}
-    return begin_part(shared, of_part, trained[needed], NOWHERE, (len(division.cells),))
+    return begin_part(shared, anchors, trained, shown(every, cameras), NOWHERE, (len(division.cells),))
 
 
 def merged(

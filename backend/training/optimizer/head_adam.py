@@ -72,12 +72,12 @@ class HeadAdam:
             rates: The learning rate of each group.
         """
         before = [parameter.detach().clone() for parameter in self._parameters]
-        with torch.no_grad():
-            for name, numbers in self._numbers.items():
-                for i in numbers:
-                    if i in self._states:
-                        self._parameters[i].sub_(self._direction(self._states[i]), alpha=count * rates[name])
         try:
+            with torch.no_grad():
+                for name, numbers in self._numbers.items():
+                    for i in numbers:
+                        if i in self._states:
+                            self._parameters[i].sub_(self._direction(self._states[i]), alpha=count * rates[name])
             yield
         finally:
             with torch.no_grad():
