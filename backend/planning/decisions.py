@@ -150,7 +150,7 @@ def planned_settings(settings: Settings, plan: Plan) -> Settings:
 
 def _votes(context: PlanningContext) -> Decision:
     views, masks = context.capture.views, sum(view.mask_file is not None for view in context.capture.views)
-    what = "votes, object IDs and object scores"
+    what = "objects from the masks"
     if not masks:
         return Decision("votes", what, False, "the capture has no masks", can_override=False)
     return Decision("votes", what, True, f"{masks} of {len(views)} views have masks")
@@ -192,7 +192,7 @@ def _surroundings(context: PlanningContext) -> Decision | None:
 def _rest(context: PlanningContext) -> Decision | None:
     if not context.labeled or context.choices.settings.zero_is_object:
         return None
-    what = "supervision of unlabeled pixels"
+    what = "learning from unlabeled pixels"
     if context.point_ids is None:
         return Decision("rest", what, None, "the votes determine how many points have no object")
     # Points outside all views are ignored: no mask votes on them.
@@ -210,7 +210,7 @@ def _rest(context: PlanningContext) -> Decision | None:
 def _labels(context: PlanningContext) -> Decision | None:
     if not context.labeled:
         return None
-    what, capture = "the label loss and its ID channel", context.capture
+    what, capture = "the loss of object IDs", context.capture
     if context.choices.settings.semantic_weight == 0:
         return Decision("labels", what, False, "--semantic-weight 0 was given", can_override=False)
     ids = len(capture.object_ids)

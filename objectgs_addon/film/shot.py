@@ -58,7 +58,7 @@ def shot_of(
             start below 0, or the reconstruction is scaled to zero.
     """
     if parent_of(root) is None:
-        raise InputError(f"{root.name} has lost its parent empty; run Import again.")
+        raise InputError(f"{root.name} has lost its parent empty; use Import Capture again.")
     if not frames:
         raise InputError("The scene's frame range is empty; set its start and end.")
     if frames[0] < 0:

@@ -15,7 +15,7 @@ STEPS = (
     ("Train", "PLAY", "turns the photos into splats; stop at any time"),
     ("Mark Objects", "GREASEPENCIL", "without masks: draw over each object"),
     ("Separate Objects", "CHECKMARK", "gives each marked object its splats"),
-    ("Clean Up", "BRUSH_DATA", "hides stray splats"),
+    ("Clean Floaters", "BRUSH_DATA", "hides stray splats"),
     ("Edit", "OUTLINER_COLLECTION", "changes the object that you click"),
     ("Extract Meshes", "MESH_DATA", "for shadows, physics, other programs"),
     ("Set Up Render", "SCENE", "before F12, to keep the photos' colors"),

@@ -17,8 +17,12 @@ class Preferences(bpy.types.AddonPreferences):
         name="Device",
         default="cpu",
         items=[
-            ("cpu", "CPU", "Works on every computer; 1.6 GB on disk"),
-            ("cuda", "NVIDIA GPU", "Also install the packages for NVIDIA graphics cards; several GB"),
+            ("cpu", "CPU", "Works on every computer; needs 2.5 GB of free disk space"),
+            (
+                "cuda",
+                "NVIDIA GPU",
+                "Also install the packages for NVIDIA graphics cards; needs 9 GB of free disk space",
+            ),
         ],
     )
     backend_python: StringProperty(

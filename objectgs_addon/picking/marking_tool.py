@@ -70,7 +70,7 @@ def _use(context: bpy.types.Context, tool: str) -> None:
 def register() -> None:
     global _registered
     if not bpy.app.background:
-        bpy.utils.register_tool(MarkTool, after={splats_tool.TOOL}, separator=False)
+        bpy.utils.register_tool(MarkTool, after={splats_tool.TOOL}, group=True)
         _registered = True
 
 

@@ -331,7 +331,7 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
     if root.objectgs.objects and job.kind != "masks":
         return
     if state.trained:
-        follow = locations.backend_job(f"Objects of {root.name}", "label", job.folder, "clean-labels", str(job.folder))
+        follow = locations.backend_job(f"Labels of {root.name}", "label", job.folder, "clean-labels", str(job.folder))
     else:
         options = ("--strategy", root.objectgs.strategy, "--max-size", str(root.objectgs.max_size))
         follow = locations.backend_job(

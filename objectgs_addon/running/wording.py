@@ -23,10 +23,22 @@ _NAMES = {
 }
 """Options, and the names of their properties or operators."""
 
-_VALUES = {"--mode explicit": "the Model Plain Splats"}
-"""Options with a value that has another name in Blender."""
-_ONLY_TYPED = (" (on the command line: `sfm`)", ", or use the option --overwrite", " or --steps")
+_PHRASES = {
+    "--mode explicit": "the Model Plain Splats",
+    "use the same --keep and --leave-out": "set the check boxes of the panel Plan as they were",
+    "try a smaller --max-size, --memory-mb or --max-anchors": "close other programs, or use a smaller Image Size",
+    "a smaller --max-size or --max-anchors, or --device cpu": "a smaller Image Size",
+    "a smaller --max-size or --max-anchors": "a smaller Image Size",
+    "close other programs or lower --memory-mb": "close other programs",
+}
+"""Advice that has other words in Blender."""
+_ONLY_TYPED = (
+    " (on the command line: `sfm`)", ", or use the option --overwrite", " or --steps", ", a different --out",
+    ", and `split` divides larger models into cells",
+)  # fmt: skip
 """Advice that Blender has no property for."""
+_FITS = re.compile(r"(?:--restart with )?--max-anchors \d+ fits")
+"""Advice for which Blender has only the size of the photos."""
 
 IMPORT_PHOTOS = "Import Photos or Video"
 """What the backend names where photos have no cameras yet."""
@@ -50,6 +62,7 @@ def in_blender(sentence: str) -> str:
     """
     if "pip install" in sentence:
         return sentence
-    for phrase, shown in {**dict.fromkeys(_ONLY_TYPED, ""), **_VALUES}.items():
+    for phrase, shown in {**dict.fromkeys(_ONLY_TYPED, ""), **_PHRASES}.items():
         sentence = sentence.replace(phrase, shown)
+    sentence = _FITS.sub("close other programs, or use a smaller Image Size and Retrain", sentence)
     return _OPTION.sub(lambda found: _NAMES.get(found.group(), found.group()), sentence)

@@ -132,7 +132,7 @@ def _warnings(views: Sequence[CameraView]) -> list[str]:
     if aspects and max(aspects) / min(aspects) - 1.0 > LARGEST_ASPECT_ERROR:
         warnings.append(
             "The capture's cameras have different pixel aspect ratios, but a Blender scene has only one; select a "
-            "camera and apply its render size before rendering through it."
+            "camera and use Set Up Render before rendering through it."
         )
     skewed = [view.name for view in views if abs(view.K[0, 1]) > 1e-6 * view.K[0, 0]]
     if skewed:

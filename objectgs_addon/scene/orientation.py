@@ -73,7 +73,7 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
 def _parent(root: bpy.types.Collection) -> bpy.types.Object:
     parent = parent_of(root)
     if parent is None:
-        raise InputError(f"{root.name} has lost its parent empty; run Import again.")
+        raise InputError(f"{root.name} has lost its parent empty; use Import Capture again.")
     return parent
 
 

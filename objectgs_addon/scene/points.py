@@ -32,7 +32,7 @@ def read_points(folder: Path) -> LabeledPoints:
     """
     path = Reconstruction(folder).points
     if not path.is_file():
-        raise InputError(f"{folder} has no points.ply; run Import again.")
+        raise InputError(f"{folder} has no points.ply; use Import Capture again.")
     return read_shown_points(path)
 
 

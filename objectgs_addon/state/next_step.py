@@ -37,8 +37,8 @@ IMPORT = Step(
     "objectgs.import_capture",
     "Import Capture",
     "IMPORT",
-    "Photos: a folder of photos; where they were taken is computed, which takes minutes. Capture: photos with their "
-    "cameras, as COLMAP and others compute them, and masks of the objects.",
+    "The first button is for your own photos or a video; where they were taken is computed, which takes minutes. The "
+    "second is for photos with their cameras, as COLMAP and other programs compute them. Masks are optional.",
 )
 ASSIGN = Step(
     "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."
@@ -78,7 +78,7 @@ MESHES = Step(
 )
 CLEAN = Step(
     "objectgs.clean_floaters",
-    "Clean Up",
+    "Clean Floaters",
     "BRUSH_DATA",
     "Hides stray splats far from their objects; they can be restored.",
     (("everything", True),),
@@ -120,9 +120,7 @@ def capture_problem(root: bpy.types.Collection, state: FolderState) -> str | Non
         return f"The capture {location} is on another computer; import it again to use it"
     if is_folder(location):
         return None
-    return (
-        f"The capture {location} is missing; put it back, or use Find Capture, in the menu at the top if nowhere else"
-    )
+    return f"The capture {location} is missing; put it back, or use Find Capture, which the + menu at the top has, too"
 
 
 def find_step(root: bpy.types.Collection) -> Step:

@@ -87,7 +87,8 @@ class ObjectItem(bpy.types.PropertyGroup):
         name="Reconstruct",
         default=True,
         update=object_edits.chosen_changed,
-        description="Train this object; otherwise it stays part of the background",
+        description="Train this object; otherwise it becomes part of the background. After the training, show and "
+        "export its splats",
     )
     object_id: IntProperty(name="ID", description="Pixel value of the object in the masks")
     points: IntProperty(
@@ -167,7 +168,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
         items=[
             ("preview", "Preview", f"For a quick check, soft ({PRESET_STEPS['preview']:,} steps)"),
             ("standard", "Standard", f"For most work ({PRESET_STEPS['standard']:,} steps)"),
-            ("final", "Best", "Until photos that are set aside for it are shown no sharper"),
+            ("final", "Best", "Until the result stops improving; this takes longest"),
             ("minutes", "Time Limit", "As good as the given time allows"),
         ],
     )

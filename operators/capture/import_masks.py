@@ -27,8 +27,8 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
     bl_label = "Import Masks"
     bl_description = (
         "Import masks of the photos that another program made: a file of COCO, CVAT or Label Studio, or a folder of "
-        "images, EXR with Cryptomatte, or run lengths. Segments of each photo are joined to objects. A folder with a "
-        "checkpoint of SAM, SAM 2.1, EdgeTAM or SAM 3 makes the segments itself"
+        "images, EXR with Cryptomatte, or JSON of Segment Anything. Segments of each photo are joined to objects. A "
+        "folder with a checkpoint of SAM, SAM 2.1, EdgeTAM or SAM 3 makes the segments itself"
     )
     bl_options = STARTS_JOB
 

@@ -38,7 +38,7 @@ def backend(cls: Any) -> bool:
 def shown(cls: Any, context: bpy.types.Context) -> bool:
     """Return whether there is an active reconstruction, for operators that do not use its folder."""
     if active_root(context) is None:
-        cls.poll_message_set("There is no reconstruction in this scene; import a capture first")
+        cls.poll_message_set("There is no reconstruction in this scene; import photos or a capture first")
         return False
     return True
 
@@ -158,7 +158,7 @@ def listed_objects(cls: Any, context: bpy.types.Context) -> bool:
         return False
     if active_root(context).objectgs.objects:
         return True
-    cls.poll_message_set("There are no objects yet; use Assign Objects first")
+    cls.poll_message_set("There are no objects yet; use Assign Objects or, without masks, Mark Objects first")
     return False
 
 

@@ -35,7 +35,7 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
         name="Coordinates",
         items=[
             ("blender", "Blender", "Positions in Blender, converted to the axes of the format"),
-            ("capture", "Capture", "Coordinates of the COLMAP model, without a change of axes"),
+            ("capture", "Capture", "Coordinates of the captured cameras, without a change of axes"),
         ],
     )
 

@@ -53,7 +53,7 @@ class SetUpBackend(bpy.types.Operator):
     bl_idname = "objectgs.set_up_backend"
     bl_label = "Set Up Backend"
     bl_description = (
-        "Download the packages of the compute backend (PyTorch and others, 1.6 GB or more) to a separate folder. "
+        "Download the packages of the compute backend (PyTorch and others) to a separate folder. "
         "Nothing else on this computer is changed"
     )
 

@@ -32,7 +32,7 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
     coordinates: EnumProperty(
         name="Coordinates",
         items=[
-            ("capture", "Capture", "Coordinates of the COLMAP model"),
+            ("capture", "Capture", "Coordinates of the captured cameras"),
             ("blender", "Upright", "Z up, as oriented on import"),
         ],
     )

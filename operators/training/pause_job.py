@@ -17,7 +17,7 @@ class PauseJob(bpy.types.Operator):
         job = background.queue.running
         if job is not None and job.can_pause:
             return True
-        cls.poll_message_set("No training is running; only training can be paused")
+        cls.poll_message_set("Nothing that can be paused is running")
         return False
 
     def execute(self, _context: bpy.types.Context) -> set[str]:

@@ -10,7 +10,9 @@ from ...objectgs_addon.running import background
 class StopJob(bpy.types.Operator):
     bl_idname = "objectgs.stop_job"
     bl_label = "Stop"
-    bl_description = "Stop this job. Its results so far are kept, and the same operator continues from there later"
+    bl_description = (
+        "Stop this job. Training, poses, meshes and film frames go on from there later; other work starts anew"
+    )
 
     index: IntProperty(
         name="Job", default=-1, description="Index in the queue; -1: the running job", options={"SKIP_SAVE"}

@@ -36,7 +36,14 @@ class Train(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.restart:
-            return context.window_manager.invoke_confirm(self, event)
+            return context.window_manager.invoke_confirm(
+                self,
+                event,
+                title="Discard the Training?",
+                message="The existing training is deleted and starts over.",
+                confirm_text="Retrain",
+                icon="WARNING",
+            )
         return self.execute(context)
 
     @reports_errors

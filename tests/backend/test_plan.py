@@ -461,7 +461,7 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, ru
     assert run_command("evaluate", out).code == EXIT_DONE and run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())
     left_out = {entry["what"]: entry["why"] for entry in report["left_out"]}
-    assert left_out["the label loss and its ID channel"] == "--leave-out labels was given"
+    assert left_out["the loss of object IDs"] == "--leave-out labels was given"
     assert "view_002.png" in left_out["training on 1 view"]
     assert not report["capture"]["exposure_varies"] and report["quality"]["miou"] is not None
     assert [own["key"] for own in report["plan"]] == [own.key for own in read_plan(out / "plan.json").decisions]

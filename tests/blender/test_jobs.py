@@ -556,6 +556,18 @@ def test_sentences_have_the_names_that_blender_shows():
     assert in_blender("It was trained with --max-size 800; choose a checkpoint as --segmenter.") == (
         "It was trained with Image Size 800; choose a checkpoint as Segmentation Model."
     )
+    assert in_blender("There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors.") == (
+        "There is not enough memory; close other programs, or use a smaller Image Size."
+    )
+    assert in_blender("It may take 9 GB; --max-anchors 9000 fits, and `split` divides larger models into cells.") == (
+        "It may take 9 GB; close other programs, or use a smaller Image Size and Retrain."
+    )
+    assert in_blender("It has another plan; use the same --keep and --leave-out, or --restart to start over.") == (
+        "It has another plan; set the check boxes of the panel Plan as they were, or Retrain to start over."
+    )
+    assert in_blender("It is of another capture; use the same one, a different --out, or --restart to start over.") == (
+        "It is of another capture; use the same one, or Retrain to start over."
+    )
     for kept in ("--seed 3", "run pip install torch --out x", "--text-file", "--per-object"):
         assert in_blender(kept) == kept
 

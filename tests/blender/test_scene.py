@@ -432,7 +432,7 @@ def test_reconstructions_in_one_file_are_separate(root, folder, tmp_path):
         ("cameras.json", None, "is no reconstruction, since it has no cameras.json"),
         ("cameras.json", b"{}", "is not a valid list of cameras"),
         ("cameras.json", b"{", "cannot be read as JSON"),
-        ("points.ply", None, "has no points.ply; run Import again"),
+        ("points.ply", None, "has no points.ply; use Import Capture again"),
         ("points.ply", b"ply\n", "no complete PLY header"),
         ("objects.json", b"[]", "is not a valid list of objects"),
     ],

@@ -108,7 +108,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         elif not marks.strokes_of(root):
             text = f"Draw over {item.name if item else 'an object'} in the viewport."
         elif not nothing:
-            text = "Press Tab for the next object. Ctrl and a stroke take away what does not belong to any."
+            text = "Press Tab for the next object. Hold Ctrl and draw where the color is on something else."
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
         write(layout, text, "INFO", rows=_ROWS)
