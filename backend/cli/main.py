@@ -98,12 +98,13 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         with ExitStack() as stack:
             with held_signals():
                 # Before signals are handled, since pycolmap installs its own SIGTERM handler when it is imported.
-                from ..commands import COMMANDS
+                from ..commands import command_of
                 from ..commands.setup.machine import owns_stdin, set_threads
 
+                run = command_of(options.command)
                 stack.enter_context(stop.listening(read_stdin=options.json and owns_stdin()))
             set_threads(options.threads)
-            COMMANDS[options.command](options, StoppingReporter(StagedReporter(reporter), stop))
+            run(options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
         fields = error.fields if isinstance(error, MissingPackage) else {}

@@ -1,42 +1,45 @@
-"""The commands, one module each: functions of the parsed options and a reporter.
-
-Importing this package imports torch, so `backend.cli.main` does it only after parsing the command line.
-"""
+"""The commands, one module each: functions of the parsed options and a reporter."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from importlib import import_module
 
 from ..shared.stopping import StoppingReporter
-from .capture import check, import_capture, import_splats, masks, plan, sfm, vote
-from .cells import merge, split, train_cell
-from .objects import clean_labels, edit, export, film, label, mesh, point, propose
-from .setup import doctor
-from .training import evaluate, render, report, train
 
-COMMANDS: dict[str, Callable[[argparse.Namespace, StoppingReporter], None]] = {
-    "sfm": sfm.sfm,
-    "masks": masks.masks,
-    "check": check.check,
-    "import": import_capture.import_capture,
-    "plan": plan.plan,
-    "vote": vote.vote,
-    "train": train.train,
-    "split": split.split,
-    "train-cell": train_cell.train_cell,
-    "merge": merge.merge,
-    "propose": propose.propose,
-    "label": label.label,
-    "clean-labels": clean_labels.clean_labels,
-    "point": point.point,
-    "render": render.render,
-    "mesh": mesh.mesh,
-    "film": film.film,
-    "edit": edit.edit,
-    "export": export.export,
-    "import-splats": import_splats.import_splats,
-    "evaluate": evaluate.evaluate,
-    "report": report.report,
-    "doctor": doctor.doctor,
+_MODULES = {
+    "sfm": "capture.sfm",
+    "masks": "capture.masks",
+    "check": "capture.check",
+    "import": "capture.import_capture",
+    "plan": "capture.plan",
+    "vote": "capture.vote",
+    "train": "training.train",
+    "split": "cells.split",
+    "train-cell": "cells.train_cell",
+    "merge": "cells.merge",
+    "propose": "objects.propose",
+    "label": "objects.label",
+    "clean-labels": "objects.clean_labels",
+    "point": "objects.point",
+    "render": "training.render",
+    "mesh": "objects.mesh",
+    "film": "objects.film",
+    "edit": "objects.edit",
+    "export": "objects.export",
+    "import-splats": "capture.import_splats",
+    "evaluate": "training.evaluate",
+    "report": "training.report",
+    "doctor": "setup.doctor",
 }
+"""Commands, and their modules, each with a function of the same name."""
+
+
+def command_of(name: str) -> Callable[[argparse.Namespace, StoppingReporter], None]:
+    """Import a command and return its function. It imports what this command needs, such as torch, and nothing else."""
+    path = _MODULES[name]
+    function: Callable[[argparse.Namespace, StoppingReporter], None] = getattr(
+        import_module(f".{path}", __package__), path.rpartition(".")[2]
+    )
+    return function
