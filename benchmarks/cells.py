@@ -5,7 +5,7 @@
 
 The capture is one of benchmarks/aerial.py. Of the steps of the training in cells, some are those of the coarse model
 and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
-cells and in all others, for both models. Memory is measured on a larger capture, too, in trainings of a few steps.
+cells and in all others, for both models. Memory is measured on larger captures, too, in trainings of a few steps.
 --write saves the figures to docs/figures/cells.json, the text to docs/cells.md and pictures of the differences to
 docs/cells.png.
 """
@@ -41,8 +41,10 @@ _OPTIONS = ("--max-anchors", "100000000", "--leave-out", "dense-points")
 _FEW = 100
 """Steps of trainings whose memory is measured."""
 
-_MEMORY_MB = 200
+_MEMORY_MB = 100
 """Memory for photos in these trainings, so that the models take most of it."""
+
+_COMMANDS = {"split": "split", "cell": "train-cell", "merge": "merge"}
 
 _QUALITY = {"psnr": ("PSNR, dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "miou_all": ("mIoU", "{:.3f}")}
 
@@ -55,19 +57,25 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=4)
     parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--large-photos", type=int, default=2000, help="photos of the capture for the memory")
-    parser.add_argument("--large-points", type=int, default=260, help="points for each of these photos")
+    parser.add_argument("--large-photos", type=int, default=2000, help="photos of the captures for the memory")
+    parser.add_argument(
+        "--large-points", type=int, nargs="+", default=[260, 1150], help="points for each photo of these captures"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    # First, since the peak memory of a child includes what this process has had at most.
+    found: dict[str, Any] = {"idle": shared.in_child("benchmarks.cells:idle")["memory_gb"]}
     shared.compile_everything()
-    large = measure_memory(_town(options.large_photos, options.large_points), options.cells)
-    print(large, file=sys.stderr, flush=True)
+    large = []
+    for points_per_photo in options.large_points:
+        large.append(measure_memory(_town(options.large_photos, points_per_photo), options.cells))
+        print(large[-1], file=sys.stderr, flush=True)
     town, runs = _town(options.photos, options.points_per_photo), []
     for seed in options.seeds:
         runs.append(measure(town, options.photos, options.cells, options.steps, seed))
         print(runs[-1], file=sys.stderr, flush=True)
-    found = {
+    found |= {
         "photos": options.photos, "cells": options.cells, "steps": options.steps, "runs": runs,
         "large_photos": options.large_photos, "large": large,
     }  # fmt: skip
@@ -81,8 +89,14 @@ def _town(photos: int, points_per_photo: int) -> Path:
     """Return the folder of a capture, which is made if it is missing."""
     town = WORK / f"town-{photos}-{points_per_photo}"
     if not (town / "labels.json").exists():
-        aerial.make(town, photos, points_per_photo=points_per_photo)
+        # In a child, for the same reason.
+        shared.in_child("benchmarks.cells:make_town", folder=str(town), photos=photos, points=points_per_photo)
     return town
+
+
+def make_town(folder: str, photos: int, points: int) -> None:
+    """Make a capture with so many points for each photo."""
+    aerial.make(Path(folder), photos, points_per_photo=points)
 
 
 def folders(seed: int) -> tuple[Path, Path]:
@@ -130,7 +144,6 @@ def measure_memory(town: Path, cells: int) -> dict[str, float]:
         "splats": export["splats"],
         "one": whole["memory_gb"],
         "cell": max(cell["memory_gb"] for cell in of_cells),
-        "idle": shared.in_child("benchmarks.cells:idle")["memory_gb"],
         **{name: part["memory_gb"] for name, part in parts.items()},
     }
 
@@ -151,9 +164,9 @@ def run(words: Sequence[str]) -> dict[str, float]:
 
 
 def idle() -> dict[str, float]:
-    """Return the peak memory in GB of a process that has imported what commands need."""
+    """Return the peak memory in GB of a process that has imported what training needs."""
+    from backend.commands.cells import train_cell  # noqa: F401
     from backend.commands.setup.machine import peak_mb
-    from backend.commands.training import train  # noqa: F401
 
     return {"memory_gb": peak_mb() / 1e3}
 
@@ -162,7 +175,8 @@ def _quality(folder: Path) -> dict[str, float]:
     """Return the quality on the held-out views, and the number of anchors."""
     shared.run_backend("evaluate", folder)
     quality = json.loads((folder / "evaluation.json").read_text())["quality"]
-    return {**{name: quality[name] for name in _QUALITY}, "anchors": _opened(folder)[1].anchors.positions.shape[0]}
+    anchors = json.loads((folder / "objectgs.json").read_text())["export"]["anchors"]
+    return {**{name: quality[name] for name in _QUALITY}, "anchors": anchors}
 
 
 def _opened(folder: Path) -> tuple[Any, Any]:
@@ -238,7 +252,7 @@ def document(found: Mapping[str, Any]) -> str:
     ones = [run["one"] for run in runs]
     of_cell = [max(cell["memory_gb"] for cell in run["cells"]) for run in runs]
     change = [run["merged"]["psnr"] - run["one"]["psnr"] for run in runs]
-    near, large = [run["differences"] for run in runs], found["large"]
+    near = [run["differences"] for run in runs]
     lines = [
         "# Training in cells",
         "",
@@ -274,18 +288,18 @@ def document(found: Mapping[str, Any]) -> str:
         "",
         "![A held-out photo, and the differences of both models to it, with the cuts between cells](cells.png)",
         "",
-        f"The most memory that processes took in {_FEW} steps on {found['large_photos']:,} such photos with "
-        f"{large['anchors']:,} anchors and {large['splats']:,} splats, with `--memory-mb {_MEMORY_MB}` for the photos. "
-        "Of it, "
-        f"{large['idle']:.2f} GB are taken by Python and its packages before anything is read:",
+        f"The most memory that processes took in {_FEW} steps on {found['large_photos']:,} such photos, in GB and "
+        f"relative to one training, with `--memory-mb {_MEMORY_MB}` for the photos. Of it, {found['idle']:.2f} GB are "
+        "taken by Python and its packages before anything is read:",
         "",
         *shared.table(
-            ["", "GB", "relative to one training"],
+            ["anchors", "splats", "one training", *(f"`{title}`" for title in _COMMANDS.values())],
             [
-                [title, f"{large[name]:.2f}", f"{large[name] / large['one']:.0%}"]
-                for name, title in (
-                    ("one", "one training"), ("split", "`split`"), ("cell", "`train-cell`"), ("merge", "`merge`")
-                )
+                [
+                    f"{large['anchors']:,}", f"{large['splats']:,}", f"{large['one']:.2f}",
+                    *(f"{large[name]:.2f} ({large[name] / large['one']:.0%})" for name in _COMMANDS),
+                ]
+                for large in found["large"]
             ],
         ),
     ]  # fmt: skip

@@ -200,7 +200,7 @@ def test_failed_import_is_one_message_until_it_is_dismissed(window, tmp_path):
         time.sleep(1)
     text, operator, label, count = window.run(script(MESSAGES))
     assert "6 photos, but not where they were taken" in text and count == 1
-    assert (operator, label) == ("objectgs.import_capture", "Choose Another Folder...")
+    assert (operator, label) == ("objectgs.import_photos", "Import Photos of This Folder...")
     time.sleep(1)
     window.shot("message")
     window.run("bpy.ops.objectgs.dismiss_message()")
