@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -179,15 +180,10 @@ def load_checkpoint(
         path = folder / name
         if not path.exists():
             continue
-        try:
-            file = open_regular(path)
-        except OSError:
-            broken = path
-            continue
-        with file:
+        with ExitStack() as opened:
             tensors: Tensors = {}
             try:
-                stored = Stored(file, former or {})
+                stored = Stored(opened.enter_context(open_regular(path)), former or {})
                 state = stored.state
                 is_other_version = isinstance(state["format"], int) and state["format"] != FORMAT
                 if not is_other_version:

@@ -92,6 +92,16 @@ def _step_rows(values, exp_avg, exp_avg_sq, seen, gradients, rates, correction1,
     return bad.sum()
 
 
+def direction(
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    correction1: float | torch.Tensor,
+    correction2: float | torch.Tensor,
+) -> torch.Tensor:
+    """Return the change of values in a step with these moments, for a learning rate of -1; arguments as `step_rows`."""
+    return (exp_avg / correction1).div_((exp_avg_sq / correction2).sqrt_().add_(EPSILON))
+
+
 def take_rows(values: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
     """Return values[seen], (n, D), for values (N, D) and seen (n,) int64."""
     return values[seen] if devices.on_gpu(values) else torch.from_numpy(_take_rows(values.numpy(), seen.numpy()))

@@ -14,7 +14,7 @@ from torch.optim.adam import adam
 
 from ...gpu.kernel import kernel
 from ...raster import devices
-from .adam import BETA1, BETA2, EPSILON
+from .adam import BETA1, BETA2, EPSILON, direction
 
 MOMENTS, STEP = ("exp_avg", "exp_avg_sq"), "step"
 """Names of the state of a parameter: tensors of its shape, and the number of steps."""
@@ -152,7 +152,7 @@ class HeadAdam:
         """Return the change of a parameter in a step of Adam, for a learning rate of -1."""
         # Of a parameter that was never updated, everything is 0.
         correction1, correction2 = ((1 - beta ** state[STEP]).clamp(min=EPSILON) for beta in (BETA1, BETA2))
-        return (state["exp_avg"] / correction1).div_((state["exp_avg_sq"] / correction2).sqrt_().add_(EPSILON))
+        return direction(state["exp_avg"], state["exp_avg_sq"], correction1, correction2)
 
     def _state(self, number: int) -> dict[str, torch.Tensor]:
         if number not in self._states:

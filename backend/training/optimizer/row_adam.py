@@ -9,7 +9,7 @@ import torch
 
 from ...model.anchors import kept_and_added
 from ...raster import devices
-from .adam import BETA1, BETA2, EPSILON, step_rows
+from .adam import BETA1, BETA2, direction, step_rows
 
 _PREFIX = "adam."
 
@@ -77,9 +77,8 @@ class RowAdam:
         """
         if not number:
             return self.exp_avg.new_zeros((len(seen), self.exp_avg.shape[1]))
-        mean = self.exp_avg[seen] / (1 - BETA1**number)
-        spread = (self.exp_avg_sq[seen] / (1 - BETA2**number)).sqrt_().add_(EPSILON)
-        return mean.div_(spread).mul_(devices.upload(-rates, mean))
+        change = direction(self.exp_avg[seen], self.exp_avg_sq[seen], 1 - BETA1**number, 1 - BETA2**number)
+        return change.mul_(devices.upload(-rates, change))
 
     def take(self, kept: torch.Tensor, added: int) -> None:
         """Apply a change of the anchors.
