@@ -5,6 +5,7 @@ import bpy
 from bpy.props import EnumProperty, StringProperty
 
 from ..environment import locations, online_access
+from ..environment.worker.layout import GIGABYTES
 from ..running import background, job_display
 
 
@@ -17,11 +18,11 @@ class Preferences(bpy.types.AddonPreferences):
         name="Device",
         default="cpu",
         items=[
-            ("cpu", "CPU", "Works on every computer; needs 2.5 GB of free disk space"),
+            ("cpu", "CPU", f"Works on every computer; needs {GIGABYTES['cpu']:g} GB of free disk space"),
             (
                 "cuda",
                 "NVIDIA GPU",
-                "Also install the packages for NVIDIA graphics cards; needs 9 GB of free disk space",
+                f"Also install packages for NVIDIA graphics cards; needs {GIGABYTES['cuda']:g} GB of free disk space",
             ),
         ],
     )

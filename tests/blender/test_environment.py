@@ -399,7 +399,7 @@ def test_unsuitable_pythons_are_rejected(root, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "ensurepip", None)
         assert "ensurepip is missing" in error()
-    monkeypatch.setitem(checks.GIGABYTES, "cpu", 1e9)
+    monkeypatch.setitem(layout.GIGABYTES, "cpu", 1e9)
     assert "free; make room" in error()
 
 

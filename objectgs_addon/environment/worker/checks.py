@@ -18,8 +18,6 @@ from . import layout
 from .events import Progress, Refused, emit, print_error
 from .programs import run
 
-GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
-"""Free disk space in GB that the setup requires for the packages and their wheels."""
 KERNEL_SECONDS = 60.0
 """Typical time of the compilation of the backend's kernels."""
 
@@ -51,7 +49,7 @@ def check_can_make_environments() -> None:
 def check_space(folder: Path, device: str) -> None:
     """Raise Refused if the disk of `folder` has too little free space."""
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
-    free, needed = shutil.disk_usage(existing).free / 1e9, GIGABYTES[device]
+    free, needed = shutil.disk_usage(existing).free / 1e9, layout.GIGABYTES[device]
     if free < needed:
         raise Refused(
             f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; make "

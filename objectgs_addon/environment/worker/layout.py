@@ -27,6 +27,8 @@ VERSIONS = "3.11, 3.12 or 3.13"
 REQUIREMENTS = ("torch.txt", "backend.txt")
 MODELS = "models.txt"
 """File of the requirements with the packages for models in folders of the user."""
+GIGABYTES = {"cpu": 2.5, "cuda": 9.0}
+"""Free disk space in GB that the setup requires for the packages and their wheels."""
 LOCKED = "locked"
 """Folder in that of the requirements with the packages of each system and their hashes."""
 

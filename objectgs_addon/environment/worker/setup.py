@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from . import layout
-from .checks import GIGABYTES, KERNEL_SECONDS, check_backend, check_can_make_environments, check_python, check_space
+from .checks import KERNEL_SECONDS, check_backend, check_can_make_environments, check_python, check_space
 from .choice import check_system, choose
 from .events import Progress, Refused, Stopped, emit, print_error
 from .pip import Pip
@@ -55,7 +55,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
             raise Refused(f"{sys.executable} could not make an environment in {folder}; choose another Python.")
         pip = Pip.of_environment(short, progress, stop)
         progress.begin("packages", "Resolving the packages")
-        chosen = choose(pip, options.requirements, device, GIGABYTES["cuda"])
+        chosen = choose(pip, options.requirements, device, layout.GIGABYTES["cuda"])
         digest = layout.requirements_digest(options.requirements, chosen.device, layout.system())
         if chosen.device != device:
             check_space(folder, chosen.device)
