@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -118,15 +118,21 @@ def gathered(parts: Iterable[Splats], most: int) -> Splats:
         parts: splats of one degree and of the same types; one part or more.
         most: upper bound of the number of splats. Rows that are not filled take addresses, but no memory.
     """
+    return Splats(**gathered_columns(map(vars, parts), most))
+
+
+def gathered_columns(parts: Iterable[Mapping[str, NDArray]], most: int) -> dict[str, NDArray]:
+    """Concatenate arrays of the same names, lengths and types, as `gathered` does."""
     whole: dict[str, NDArray] = {}
     count = 0
     for part in parts:
-        for name, values in vars(part).items():
+        length = len(next(iter(part.values())))
+        for name, values in part.items():
             if name not in whole:
                 whole[name] = np.empty((most, *values.shape[1:]), values.dtype)
-            whole[name][count : count + len(part)] = values
-        count += len(part)
-    return Splats(**{name: values[:count] for name, values in whole.items()})
+            whole[name][count : count + length] = values
+        count += length
+    return {name: values[:count] for name, values in whole.items()}
 
 
 def blocks(count: int) -> Iterator[slice]:

@@ -157,7 +157,9 @@ def require_checkpoint(
     return found
 
 
-def read_result(folder: Path, keep: Keep | None = None) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
+def read_result(
+    folder: Path, keep: Keep | None = None, fixed: bool = True
+) -> tuple[dict[str, np.ndarray], dict[str, Any], str | None]:
     """Read the result of a training from its checkpoint, without what only its continuation depends on.
 
     That takes a quarter of the memory of the whole checkpoint.
@@ -165,6 +167,7 @@ def read_result(folder: Path, keep: Keep | None = None) -> tuple[dict[str, np.nd
     Args:
         folder: The folder of the checkpoint.
         keep: Chooses among a block of the anchors those that are kept in memory; None: all.
+        fixed: Whether anchors that the training did not change are read, too.
 
     Returns:
         The tensors, as in a checkpoint, of the mean of the model over the latest steps, the state, and a warning or
@@ -173,10 +176,10 @@ def read_result(folder: Path, keep: Keep | None = None) -> tuple[dict[str, np.nd
     Raises:
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
-    return require_checkpoint(folder, lambda stored, state: _take_result(stored, state, keep))
+    return require_checkpoint(folder, lambda stored, state: _take_result(stored, state, keep, fixed))
 
 
-def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None) -> dict[str, np.ndarray]:
+def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None, with_fixed: bool) -> dict[str, np.ndarray]:
     """Return the tensors that `read_result` returns."""
     mean = {name.removeprefix(PREFIX) for name in stored if name.startswith(PREFIX)}
     others = [name for name in stored if not name.startswith(("adam.", "growth.", "anchors.", PREFIX))]
@@ -184,12 +187,13 @@ def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None) -> di
     count = len(stored["anchors.ids"])
     # Fixed anchors, the first ones, have no mean.
     fixed = Region.of(state).fixed if "rows" in mean else count
+    begin = 0 if with_fixed else Region.of(state).fixed
     size = count if keep is None else _BLOCK
     blocks = []
-    for first in range(0, max(count, 1), max(size, 1)):
+    for first in range(begin, max(count, begin + 1), max(size, 1)):
         last = min(first + size, count)
         positions, ids = (stored.part(f"anchors.{name}", first, last) for name in ("positions", "ids"))
-        rows = [stored.part("anchors.rows", first, min(last, fixed))] if first < fixed or not count else []
+        rows = [stored.part("anchors.rows", first, min(last, fixed))] if first < fixed or first == last else []
         if last > fixed:
             rows.append(stored.part(PREFIX + "rows", max(first - fixed, 0), last - fixed))
         block = positions, _joined(rows), ids

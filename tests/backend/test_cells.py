@@ -25,9 +25,10 @@ from backend.shared.reconstruction.lock import locked
 from backend.training.cells.division import NO_CELL, Cell, Division, divide, read_division, write_division
 from backend.training.cells.parts import (
     anchors_of,
+    around_seams,
     begin_cell,
     begin_seams,
-    join_cells,
+    core_of,
     merged,
     shown,
     trained_in,
@@ -193,15 +194,25 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     for number in range(2):
         needed, of_needed = needed_by(coarse, division, number, cell_of, cameras)
         cells.append(begin_cell(needed, division, number, of_needed))
-    counts = [int((cell_of == number).sum()) for number in range(2)]
+        save_checkpoint(tmp_path / str(number), *cells[-1])
     of_none = {name: value[cell_of == NO_CELL] for name, value in expected.items()}
-    joined = join_cells(of_none, division, cells, counts)
     coarse = without_anchors(coarse)
     assert not {name for name in coarse[0] if name.startswith("anchors.")}
-    seams = begin_seams(coarse, division, joined, 5, cameras)
+
+    def read(keep):
+        found = [read_result(tmp_path / str(n), keep(n), fixed=False)[:2] for n in range(2)]
+        return [anchors_of(checkpoint) for checkpoint in found]
+
+    count, cores = len(expected["ids"]), read(lambda n: core_of(division, n))
+    assert [len(core["ids"]) for core in cores] == [int((cell_of == number).sum()) for number in range(2)]
+    near = read(lambda n: around_seams(division, n, cameras))
+    seams = begin_seams(coarse, division, of_none, near, count, cameras)
     on_seams = len(seams[0]["anchors.ids"]) - Region.of(seams[1]).fixed
-    assert 0 < on_seams < len(joined["ids"]) / 2
-    tensors, state = merged(coarse, division, joined, 5, seams, whole.progress, "0f")
+    assert 0 < on_seams < count / 2
+    save_checkpoint(tmp_path / "seams", *seams)
+    seams = read_result(tmp_path / "seams", fixed=False)[:2]
+    assert len(seams[0]["anchors.ids"]) == on_seams
+    tensors, state = merged(coarse, division, of_none, cores, count, seams, whole.progress, "0f")
     order, wanted = (np.lexsort(found.T) for found in (tensors["anchors.positions"], expected["positions"]))
     for name, values in expected.items():
         assert np.array_equal(tensors[f"anchors.{name}"][order], values[wanted]), name
@@ -391,6 +402,9 @@ def test_damaged_files_of_cells_are_named(divided, run_command):
     assert_rejected(run_command("merge", divided), "run `train-cell` for this cell again")
     assert run_command("train-cell", divided, "--cell", 0, "--steps", 3).code == EXIT_DONE
     assert run_command("merge", divided).code == EXIT_DONE, "what the message says has helped"
+    part = divided / "cells" / "1" / "part.json"
+    part.write_text(json.dumps({**json.loads(part.read_text()), "anchors": 1}))
+    assert_rejected(run_command("merge", divided), "anchors instead of 1", "--restart")
 
 
 def test_damaged_model_is_not_divided(divided, run_command):
@@ -431,8 +445,8 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
     def watch(name):
         original = getattr(opening, name)
 
-        def wrapper(*arguments):
-            found = original(*arguments)
+        def wrapper(*arguments, **named):
+            found = original(*arguments, **named)
             if name == "open_trained":
                 assert len(found.model.anchors) == 0
             elif arguments[0].name == "coarse":
@@ -449,6 +463,7 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
 
     watch("open_trained")
     watch("read_part")
+    whole = Trainer.restore
     monkeypatch.setattr(Trainer, "restore", classmethod(restore))
     monkeypatch.setattr(memory, "free_memory", lambda: 1e6)
     before = contents_of(divided)
@@ -460,8 +475,9 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
     assert state["settings"]["max_anchors"] == 4321
     assert_rejected(run_command(*train, "--max-anchors", 5), "4321", "--restart")
     coarse.clear()
-    assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
-    assert run_command("merge", divided).code == EXIT_DONE and not coarse
+    assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE and not coarse
+    monkeypatch.setattr(Trainer, "restore", whole)
+    assert run_command("merge", divided).code == EXIT_DONE
     assert kept[-1] < 0.1 * anchors < kept[0] <= anchors, "merging needs only the anchors that belong to no cell"
 
 

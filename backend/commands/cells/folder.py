@@ -161,21 +161,24 @@ def cells_of(division: Division, scene: Scene, positions: np.ndarray) -> np.ndar
     return np.where(near, division.cells_of(positions), NO_CELL)
 
 
-def read_part(folder: Path, keep: Keep | None = None) -> Checkpoint:
-    """Return the model in a folder of cells/, as in its checkpoint; keep: as in `read_result`.
+def read_part(folder: Path, keep: Keep | None = None, fixed: bool = True) -> Checkpoint:
+    """Return the model in a folder of cells/, as in its checkpoint; keep, fixed: as in `read_result`.
 
     Raises:
         InputError: it is missing or damaged.
     """
-    damaged = InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
     try:
-        tensors, state, warning = read_result(folder, keep)
+        tensors, state, warning = read_result(folder, keep, fixed)
     except InputError as error:
-        raise damaged from error
+        raise _damaged(folder) from error
     if warning:
         # An older one is not what its record describes.
-        raise damaged
+        raise _damaged(folder)
     return tensors, state
+
+
+def _damaged(folder: Path) -> InputError:
+    return InputError(f"{folder / CURRENT} is missing or damaged; run `train-cell` for this cell again.")
 
 
 def require_unchanged(folder: Reconstruction, division: Division, folders: CellFolders) -> None:
@@ -193,7 +196,9 @@ def require_unchanged(folder: Reconstruction, division: Division, folders: CellF
 
 
 def digest_of(folder: Path) -> str:
-    """Return a hash of the checkpoint in a folder of cells/."""
+    """Return a hash of the checkpoint in a folder of cells/; raise InputError if it is missing."""
+    if not (folder / CURRENT).exists():
+        raise _damaged(folder)
     return _digest(folder / CURRENT)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +18,16 @@ from ...shared.reconstruction.record import update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
 from ...training.cells.division import NO_CELL
-from ...training.cells.parts import Checkpoint, anchors_of, begin_seams, join_cells, merged, without_anchors
-from ...training.state import load_model
+from ...training.cells.parts import (
+    Checkpoint,
+    anchors_of,
+    around_seams,
+    begin_seams,
+    core_of,
+    merged,
+    without_anchors,
+)
+from ...training.state import Keep, model_from_checkpoint, progress_of
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
 from ..folder import READ, memory_for_targets, outdate_results, require_reconstruction
@@ -43,15 +52,15 @@ FIRST = 0.7
 _FRACTION, _MOST = 0.05, 2000
 """Number of steps of the seams, relative to the sum of those of all cells, and at most."""
 
-_JOIN, _TRAIN = "join", "train"
+_SEAMS, _TRAIN, _JOIN = "seams", "train", "join"
 
 
 def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Replace the reconstruction's model by that of its cells, and export it."""
     reporter.expect(
         {
-            READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _JOIN: ("Joining", 5.0),
-            _TRAIN: ("Training", 60.0), EXPORT: ("Saving", 5.0),
+            READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _SEAMS: ("Preparing", 5.0),
+            _TRAIN: ("Training", 60.0), _JOIN: ("Joining", 5.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
     folder = Reconstruction(options.folder)
@@ -59,40 +68,66 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     with locked(folder.folder):
         divided = open_divided(options, reporter)
         require_unchanged(folder, divided.division, divided.folders)
-        device = divided.device
+        reporter.expect({KERNELS: ("Preparing", kernel_seconds(divided.device))})
+        ensure_kernels(reporter, divided.device)
         with divided.folders.locked():
-            cells = _finished_cells(divided)
-            reporter.begin(_JOIN, f"Joining {len(cells)} cells")
-            parts = [divided.folders.cell(number) / CHECKPOINT for number in range(len(cells))]
-            counts = [cell.anchors for cell in cells]
-            coarse, _ = divided.read_coarse(lambda _, cell_of: cell_of == NO_CELL)
-            of_none, shared = anchors_of(coarse), without_anchors(coarse)
-            joined = join_cells(of_none, divided.division, map(read_part, parts), counts)
-            of = (divided.key, *map(digest_of, parts))
-        surroundings = len(of_none["ids"])
-        del coarse, of_none
-        steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
-        reporter.expect({KERNELS: ("Preparing", kernel_seconds(device))})
-        ensure_kernels(reporter, device)
-        seams = _train_seams(divided, shared, joined, surroundings, steps, of, options, reporter)
-        spent = [divided.progress, seams]
-        progress = TrainingProgress(
-            step=sum(p.step for p in spent) + sum(cell.steps for cell in cells),
-            seconds=sum(p.seconds for p in spent) + sum(cell.seconds for cell in cells),
-            curve=divided.progress.curve,
-        )
-        trained = read_part(divided.folders.seams / CHECKPOINT)
-        tensors, state = merged(shared, divided.division, joined, surroundings, trained, progress, divided.key)
+            tensors, state = _merge(divided, options, reporter)
         save_checkpoint(folder.checkpoint, tensors, state)
-        del tensors, joined, trained
         outdate_results(folder)
+        progress = progress_of(state)
         update_record(folder, training=replace(divided.training, steps=progress.step, minutes=None, preset=None))
-        finish_stage(folder, "merge", seams.seconds)
-        model = load_model(folder.checkpoint, device)[0]
+        model = model_from_checkpoint(tensors, state).to(divided.device)
         export_model(model, divided.scene, folder, reporter)
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(model.anchors), splats=str(folder.splats)
     )
+
+
+def _merge(divided: Divided, options: argparse.Namespace, reporter: StoppingReporter) -> Checkpoint:
+    """Return the checkpoint of the whole model, after its seams are trained.
+
+    The cells are read twice, so that not all of them are in memory while the seams are trained.
+    """
+    cells = _finished_cells(divided)
+    coarse, _ = divided.read_coarse(lambda _, cell_of: cell_of == NO_CELL)
+    of_none, shared = anchors_of(coarse), without_anchors(coarse)
+    most = len(of_none["ids"]) + sum(cell.anchors for cell in cells)
+    steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
+
+    def begin() -> Checkpoint:
+        reporter.begin(_SEAMS, "Reading the anchors where cells meet")
+        cameras = divided.cameras(divided.division.seam_views)
+        near = (_read_cell(divided, n, around_seams(divided.division, n, cameras)) for n in range(len(cells)))
+        return begin_seams(shared, divided.division, of_none, near, most, cameras)
+
+    seams = _train_seams(divided, begin, steps, options, reporter)
+    progress = TrainingProgress(
+        step=divided.progress.step + seams.step + sum(cell.steps for cell in cells),
+        seconds=divided.progress.seconds + seams.seconds + sum(cell.seconds for cell in cells),
+        curve=divided.progress.curve,
+    )
+    reporter.begin(_JOIN, f"Joining {len(cells)} cells")
+    trained = read_part(divided.folders.seams / CHECKPOINT, fixed=False)
+    cores = (_read_core(divided, n, cell.anchors) for n, cell in enumerate(cells))
+    checkpoint = merged(shared, divided.division, of_none, cores, most, trained, progress, divided.key)
+    finish_stage(divided.folder, "merge", seams.seconds)
+    return checkpoint
+
+
+def _read_core(divided: Divided, number: int, count: int) -> dict[str, np.ndarray]:
+    """Return the anchors in the core of a cell; raise InputError if there are not `count` of them."""
+    core = _read_cell(divided, number, core_of(divided.division, number))
+    if len(core["ids"]) != count:
+        raise InputError(
+            f"{divided.folders.cell(number)} has {len(core['ids'])} anchors instead of {count}; run `train-cell` with "
+            "--restart for this cell."
+        )
+    return core
+
+
+def _read_cell(divided: Divided, number: int, keep: Keep) -> dict[str, np.ndarray]:
+    """Return anchors that a cell has trained."""
+    return anchors_of(read_part(divided.folders.cell(number) / CHECKPOINT, keep, fixed=False))
 
 
 def _finished_cells(divided: Divided) -> list[PartRecord]:
@@ -111,18 +146,16 @@ def _finished_cells(divided: Divided) -> list[PartRecord]:
 
 def _train_seams(
     divided: Divided,
-    shared: Checkpoint,
-    joined: dict[str, np.ndarray],
-    surroundings: int,
+    begin: Callable[[], Checkpoint],
     steps: int,
-    of: tuple[str, ...],
     options: argparse.Namespace,
     reporter: StoppingReporter,
 ) -> TrainingProgress:
-    """Train the joined anchors where cells meet, or go on with that; returns the progress."""
+    """Train the anchors where cells meet, from the checkpoint that `begin` returns, or go on with that; returns the
+    progress."""
     folder, device, gains = divided.folders.seams, divided.device, divided.scene.gains
-    names, memory = divided.division.seam_views, memory_for_targets(options)
-    capture = divided.restricted(names)
+    of = (divided.key, *(digest_of(divided.folders.cell(n) / CHECKPOINT) for n in range(len(divided.division.cells))))
+    memory, capture = memory_for_targets(options), divided.restricted(divided.division.seam_views)
     make_folder(folder)
     remove_abandoned(folder)
     resumed = None
@@ -138,9 +171,7 @@ def _train_seams(
             reporter.warning(warning)
     else:
         shutil.rmtree(folder / CHECKPOINT, ignore_errors=True)
-        begun = begin_seams(shared, divided.division, joined, surroundings, divided.cameras(names))
-        trainer = Trainer.restore(capture, *begun, memory, device, gains)
-        del begun
+        trainer = Trainer.restore(capture, *begin(), memory, device, gains)
         write_part_record(folder, PartRecord(of))
     reporter.begin(_TRAIN, f"Training {len(trainer.model.anchors) - trainer.region.fixed:,} anchors where cells meet")
     if capture.train_indices:

@@ -6,6 +6,7 @@ size and table of objects, so that their anchors can be put together again witho
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -14,10 +15,11 @@ import torch
 
 from ...model.anchors import Anchors
 from ...model.object_model import anchors_in_view
+from ...model.splats import gathered_columns
 from ...raster import Camera
-from ...shared.errors import InputError
 from ..budget import TrainingProgress
 from ..settings import Settings
+from ..state import Keep
 from ..step import frustum
 from .division import NO_CELL, Division
 from .region import Bounds, Region, inside
@@ -96,63 +98,50 @@ def begin_cell(coarse: Checkpoint, division: Division, number: int, cell_of: np.
     return begin_part(coarse, anchors, trained, ~trained, division.cells[number].bounds, (number,))
 
 
-def join_cells(
-    of_none: dict[str, np.ndarray], division: Division, cells: Iterable[Checkpoint], counts: Sequence[int]
-) -> dict[str, np.ndarray]:
-    """Return the anchors of the coarse model that belong to no cell, followed by those in the cores of trained cells.
+def core_of(division: Division, number: int) -> Keep:
+    """Return which anchors of a trained cell the merged model has, for `read_result` without fixed ones."""
+    return lambda anchors: inside(anchors.positions.numpy(), division.cells[number].core)
 
-    Args:
-        of_none: these anchors of the coarse model, as from `anchors_of`.
-        division: the cells.
-        cells: checkpoint of each cell, read one after another.
-        counts: number of anchors in the core of each cell.
 
-    Returns:
-        Positions, rows and IDs, as from `anchors_of`.
-
-    Raises:
-        InputError: a cell has another number of anchors.
-    """
-    end = len(of_none["ids"])
-    joined = {name: np.empty((end + sum(counts), *values.shape[1:]), values.dtype) for name, values in of_none.items()}
-    for name, values in of_none.items():
-        joined[name][:end] = values
-    for cell, checkpoint, count in zip(division.cells, cells, counts, strict=True):
-        fixed, anchors = Region.of(checkpoint[1]).fixed, anchors_of(checkpoint)
-        here = fixed + np.flatnonzero(inside(anchors["positions"][fixed:], cell.core))
-        if len(here) != count:
-            raise InputError(
-                f"A cell has {len(here)} anchors instead of {count}; it was changed, so run `merge` again."
-            )
-        for name, values in anchors.items():
-            joined[name][end : end + len(here)] = values[here]
-        end += len(here)
-    return joined
+def around_seams(division: Division, number: int, cameras: Sequence[Camera]) -> Keep:
+    """Return which of these are on seams or shown by the cameras, which are those that show seams."""
+    is_core = core_of(division, number)
+    return lambda anchors: is_core(anchors) & (division.on_seams(anchors.positions.numpy()) | shown(anchors, cameras))
 
 
 def begin_seams(
-    shared: Checkpoint, division: Division, anchors: dict[str, np.ndarray], surroundings: int, cameras: Iterable[Camera]
+    shared: Checkpoint,
+    division: Division,
+    of_none: dict[str, np.ndarray],
+    cells: Iterable[dict[str, np.ndarray]],
+    most: int,
+    cameras: Sequence[Camera],
 ) -> Checkpoint:
-    """Return the checkpoint from which the seams of joined cells are trained; no anchors are added.
+    """Return the checkpoint from which the seams of trained cells are trained; no anchors are added.
 
     Args:
         shared: checkpoint of the coarse model, of whose anchors nothing is used.
         division: the cells.
-        anchors: the joined anchors, from `join_cells`.
-        surroundings: number of the first of them that belong to no cell.
+        of_none: anchors of the coarse model that belong to no cell, as from `anchors_of`.
+        cells: the anchors `around_seams` of each cell, read one after another.
+        most: upper bound of the number of all anchors.
         cameras: the training views that show seams, in scene units.
     """
-    trained = _on_seams(division, anchors, surroundings)
     settings, voxel = Settings(**shared[1]["settings"]), float(shared[1]["voxel"])
-    every = Anchors(settings.layout, voxel, *(torch.from_numpy(anchors[name]) for name in _OF_ANCHORS))
-    return begin_part(shared, anchors, trained, shown(every, cameras), NOWHERE, (len(division.cells),))
+    every = Anchors(settings.layout, voxel, *(torch.from_numpy(of_none[name]) for name in _OF_ANCHORS))
+    near = shown(every, cameras)
+    around = {name: values[near] for name, values in of_none.items()}
+    anchors = gathered_columns(itertools.chain([around], cells), most)
+    trained = _on_seams(division, anchors, int(near.sum()))
+    return begin_part(shared, anchors, trained, ~trained, NOWHERE, (len(division.cells),))
 
 
 def merged(
     shared: Checkpoint,
     division: Division,
-    anchors: dict[str, np.ndarray],
-    surroundings: int,
+    of_none: dict[str, np.ndarray],
+    cells: Iterable[dict[str, np.ndarray]],
+    most: int,
     seams: Checkpoint,
     progress: TrainingProgress,
     key: str,
@@ -160,21 +149,20 @@ def merged(
     """Return the checkpoint of the whole model, after the training of the seams.
 
     Args:
-        shared, division, anchors, surroundings: as for `begin_seams`.
-        seams: checkpoint of the trained seams.
+        shared, division, of_none, most: as for `begin_seams`.
+        cells: the anchors in the core of each cell, read one after another.
+        seams: checkpoint of the trained seams, without fixed anchors.
         progress: of the whole training.
         key: hash of the division, which the state keeps until the model is trained further.
-
-    The joined anchors are changed in place.
     """
     tensors, state = shared
-    fixed, trained = Region.of(seams[1]).fixed, anchors_of(seams)
-    of_seams = _on_seams(division, anchors, surroundings)
-    if int(of_seams.sum()) == len(trained["ids"]) - fixed:
-        anchors["rows"][of_seams] = trained["rows"][fixed:]
+    trained, anchors = anchors_of(seams), gathered_columns(itertools.chain([of_none], cells), most)
+    of_seams = _on_seams(division, anchors, len(of_none["ids"]))
+    if int(of_seams.sum()) == len(trained["ids"]):
+        anchors["rows"][of_seams] = trained["rows"]
     else:
         # Anchors whose parameters were not finite have been removed.
-        anchors = {name: np.concatenate([anchors[name][~of_seams], trained[name][fixed:]]) for name in _OF_ANCHORS}
+        anchors = {name: np.concatenate([anchors[name][~of_seams], trained[name]]) for name in _OF_ANCHORS}
     made = _untrained(tensors, anchors, 0, Settings(**state["settings"]))
     return made, {**state, "progress": {**progress.__dict__}, MERGED_OF: key}
 
