@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from ..capture import Capture
-from ..export import agreement, fit_splats, write_anchors, write_splats
+from ..export import (
+    ExactSplats,
+    FittedSplats,
+    ModelSplats,
+    agreement,
+    fit_splats,
+    write_anchors,
+    write_splat_parts,
+)
 from ..model.object_model import ObjectModel
 from ..shared.events import Reporter
 from ..shared.formats.json_file import plain
@@ -51,22 +59,27 @@ def _write_export(
 ) -> ExportRecord:
     reporter.begin(EXPORT, f"Writing {folder.splats.name}")
     capture = scene.capture
+    splats: ModelSplats
     if model.explicit:
-        splats, source = model.splats()
+        splats = ExactSplats(model)
     else:
-        splats, source = fit_splats(model, [scene.camera(i) for i in capture.train_indices], reporter)
+        cameras = [scene.camera(i) for i in capture.train_indices]
+        splats = FittedSplats(model, *fit_splats(model, cameras, reporter))
     background = [round(float(value), 4) for value in model.background.detach().cpu()]
     psnr = on_black = None
     if compare:
         most = _COMPARED_VIEWS if _is_approximate(model) else _CHECKED_VIEWS
         views = (capture.test_indices or capture.train_indices)[:most]
-        found = agreement(model, splats, source, [scene.camera(i) for i in views])
+        found = agreement(model, splats, [scene.camera(i) for i in views])
         psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
-    for sentence in write_splats(folder.splats, splats, background=background):
+    count, warnings = write_splat_parts(
+        folder.splats, lambda: (part.splats for part in splats.parts()), background=background
+    )
+    for sentence in warnings:
         reporter.warning(sentence)
-    write_anchors(folder.anchors, model, splats, source)
-    return ExportRecord(len(splats), len(model.anchors), _rounded(psnr), _rounded(on_black), background)
+    write_anchors(folder.anchors, model, splats)
+    return ExportRecord(count, len(model.anchors), _rounded(psnr), _rounded(on_black), background)
 
 
 def _is_approximate(model: ObjectModel) -> bool:

@@ -5,11 +5,13 @@ from .background import background_sphere
 from .fit import agreement, fit_splats
 from .foreign import read_foreign_splats
 from .levels import coarser_splats
-from .ply import read_splats, splat_table, write_splats
+from .model_splats import ExactSplats, FittedSplats, ModelSplats
+from .ply import read_splats, splat_table, write_splat_parts, write_splats
 from .splat import read_splat, write_splat
 from .spz import DOWN_TO_UP, read_spz, write_spz
 
 __all__ = [
-    "DOWN_TO_UP", "agreement", "background_sphere", "coarser_splats", "fit_splats", "read_foreign_splats",
-    "read_splat", "read_splats", "read_spz", "splat_table", "write_anchors", "write_splat", "write_splats", "write_spz",
+    "DOWN_TO_UP", "ExactSplats", "FittedSplats", "ModelSplats", "agreement", "background_sphere", "coarser_splats",
+    "fit_splats", "read_foreign_splats", "read_splat", "read_splats", "read_spz", "splat_table", "write_anchors",
+    "write_splat", "write_splat_parts", "write_splats", "write_spz",
 ]  # fmt: skip

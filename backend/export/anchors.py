@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from ..model.object_model import ObjectModel
-from ..model.splats import Splats, blocks
+from ..model.splats import blocks
 from ..raster import devices
 from ..shared.formats.anchors_ply import AnchorTable, write_anchor_tables
-from .ply import position_kind
+from .model_splats import ModelSplats
+from .ply import Positions
 
 
-def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.ndarray) -> None:
+def write_anchors(path: Path, model: ObjectModel, splats: ModelSplats) -> None:
     """Write the anchors of a model as PLY, atomically.
 
     Positions have the same type as in a PLY file of `splats`.
@@ -21,17 +22,17 @@ def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.nda
     Args:
         path: The file to write.
         model: The model with the anchors.
-        splats: The N splats of the model.
-        source: (N,) int64, the offset that each splat was generated from: anchor * offsets + offset.
+        splats: The splats of the model.
     """
     anchors = model.anchors
     count, k = len(anchors), anchors.layout.offsets
     numbers, opacities = np.zeros(count, np.int64), np.zeros(count)
-    for rows in blocks(len(source)):
-        owner = source[rows] // k
-        # Summed in the order of the splats, so that the sums do not depend on the blocks.
+    positions = Positions()
+    for part, source in splats.parts():
+        owner = source // k
         np.add.at(numbers, owner, 1)
-        np.add.at(opacities, owner, splats.opacities[rows])
+        np.add.at(opacities, owner, part.opacities)
+        positions.add(part)
     opacities /= np.maximum(numbers, 1)
 
     def table(rows: slice) -> AnchorTable:
@@ -46,4 +47,4 @@ def write_anchors(path: Path, model: ObjectModel, splats: Splats, source: np.nda
             numbers[rows],
         )
 
-    write_anchor_tables(path, count, map(table, blocks(count)), position_kind(splats))
+    write_anchor_tables(path, count, map(table, blocks(count)), positions.kind)

@@ -26,6 +26,7 @@ from ..raster import Camera, devices, rasterize
 from ..raster.reference import rotation_matrices
 from ..shared.events import Reporter
 from ..shared.splats import spherical_harmonics
+from .model_splats import ModelSplats
 
 SH_DEGREE = 2
 
@@ -82,38 +83,33 @@ class Agreement(NamedTuple):
     on_black: float
 
 
-def agreement(
-    model: ObjectModel, splats: Splats, source: NDArray[np.int64], cameras: Sequence[Camera]
-) -> Agreement | None:
+def agreement(model: ObjectModel, splats: ModelSplats, cameras: Sequence[Camera]) -> Agreement | None:
     """Measure how well plain splats reproduce a model, whose renders have its background.
 
     Args:
         model: The model.
-        splats: The N exported splats in world units.
-        source: (N,) int64, the offset that each was generated from: anchor * offsets + offset.
+        splats: The exported splats.
         cameras: The cameras in scene units.
 
     Returns:
         The agreement; None if there are no cameras.
     """
-    found = [_agreement(model, splats, source, camera) for camera in cameras]
+    found = [_agreement(model, splats, camera) for camera in cameras]
     return Agreement(*np.mean(found, axis=0).tolist()) if found else None
 
 
-def _agreement(model: ObjectModel, splats: Splats, source: NDArray[np.int64], camera: Camera) -> list[float]:
+def _agreement(model: ObjectModel, splats: ModelSplats, camera: Camera) -> list[float]:
     """Return the figures of one view, for which only splats of anchors in view are converted."""
 
     def tensor(values: NDArray) -> torch.Tensor:
         return devices.upload(np.ascontiguousarray(values, np.float32), model.device)
 
     wanted = draw(model, camera, want_ids=False).image
-    in_view = np.zeros(len(model.anchors), np.bool_)
-    in_view[devices.host(_anchors_in_view(model, camera))] = True
-    rows = np.flatnonzero(np.repeat(in_view, model.anchors.layout.offsets)[source])
-    means = tensor(model.normalization.to_scene(splats.means[rows]))
-    scales = tensor(splats.scales[rows] * model.normalization.scale)
-    quats, opacities, sh = tensor(splats.quats[rows]), tensor(splats.opacities[rows]), tensor(splats.sh[rows])
-    ids = torch.zeros(len(rows), dtype=torch.int32, device=model.device)
+    near = splats.of(_anchors_in_view(model, camera)).splats
+    means = tensor(model.normalization.to_scene(near.means))
+    scales = tensor(near.scales * model.normalization.scale)
+    quats, opacities, sh = tensor(near.quats), tensor(near.opacities), tensor(near.sh)
+    ids = torch.zeros(len(near), dtype=torch.int32, device=model.device)
     with torch.no_grad():
         drawn = rasterize(means, quats, scales, opacities, sh, ids, camera)
     gain = torch.tensor(camera.gain).to(drawn.color.device)[:, None, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,57 +56,84 @@ def write_splats(
     Raises:
         ValueError: An object ID is not in 0 .. 2^32 - 1.
     """
-    path = Path(path)
-    keep = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    parts = [splats.select(rows) for rows in blocks(len(splats))] or [splats]
+    return write_splat_parts(path, lambda: parts, with_ids, background)[1]
+
+
+def write_splat_parts(
+    path: Path,
+    make: Callable[[], Iterable[Splats]],
+    with_ids: bool = True,
+    background: Sequence[float] | None = None,
+) -> tuple[int, list[str]]:
+    """Write splats as PLY, as `write_splats`, without having all of them in memory.
+
+    Args:
+        path, with_ids, background: As for `write_splats`.
+        make: Returns the splats in parts, at least one, the same each time; called twice.
+
+    Returns:
+        The number of splats in the file, and warnings about those that were left out.
+
+    Raises:
+        ValueError: As from `write_splats`.
+    """
+    path, total, count, degree, some_unobserved = Path(path), 0, 0, 0, False
+    positions = Positions()
+    for part in make():
+        total, degree = total + len(part), part.degree
+        part = _only_usable(part)
+        if len(part) and (part.object_ids.min() < 0 or part.object_ids.max() > LARGEST_ID):
+            raise ValueError("object IDs must be from 0 to 2^32 - 1")
+        positions.add(part)
+        count += len(part)
+        some_unobserved |= bool(part.unobserved.any())
     warnings = []
-    if not keep.all():
+    if count < total:
         warnings.append(
-            f"{int((~keep).sum())} of {len(splats)} splats were not written to {path.name}: "
+            f"{total - count} of {total} splats were not written to {path.name}: "
             "they hold NaN, Inf or a zero quaternion."
         )
-        splats = splats.select(keep)
-    if len(splats) and (splats.object_ids.min() < 0 or splats.object_ids.max() > LARGEST_ID):
-        raise ValueError("object IDs must be from 0 to 2^32 - 1")
-
-    names = [name for name in property_names(splats.degree) if with_ids or name != OBJECT_ID]
-    if with_ids and splats.unobserved.any():
+    names = [name for name in property_names(degree) if with_ids or name != OBJECT_ID]
+    if with_ids and some_unobserved:
         names.append(UNOBSERVED)
-    dtype = splat_dtype(names, position_kind(splats))
-
+    dtype = splat_dtype(names, positions.kind)
     comments = [background_comment(background)] if background else []
-    tables = (_rows(splats, rows, dtype) for rows in blocks(len(splats)))
-    write_vertex_blocks(path, dtype, len(splats), tables, comments)
-    return warnings
+    write_vertex_blocks(path, dtype, count, (_rows(_only_usable(part), dtype) for part in make()), comments)
+    return count, warnings
 
 
 def splat_table(splats: Splats) -> NDArray:
     """Return all splats as the records of `write_splats`, always with IDs and `unobserved`."""
-    dtype = splat_dtype([*property_names(splats.degree), UNOBSERVED], position_kind(splats))
-    return _rows(splats, slice(None), dtype)
+    positions = Positions()
+    positions.add(splats)
+    return _rows(splats, splat_dtype([*property_names(splats.degree), UNOBSERVED], positions.kind))
 
 
-def _rows(splats: Splats, rows: slice, dtype: np.dtype) -> NDArray:
-    """Return the records of a slice of the splats."""
-    means = splats.means[rows]
-    table = np.zeros(len(means), dtype)
+def _rows(splats: Splats, dtype: np.dtype) -> NDArray:
+    """Return the records of splats."""
+    table = np.zeros(len(splats), dtype)
     for axis, name in enumerate(MEANS):
-        table[name] = means[:, axis]
-    sh = splats.sh[rows]
-    for k, names in enumerate(sh_names(sh.shape[1])):
+        table[name] = splats.means[:, axis]
+    for k, names in enumerate(sh_names(splats.sh.shape[1])):
         for channel, name in enumerate(names):
-            table[name] = sh[:, k, channel]
-    opacity = np.clip(splats.opacities[rows].astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
+            table[name] = splats.sh[:, k, channel]
+    opacity = np.clip(splats.opacities.astype(np.float64), OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
     table[OPACITY] = np.log(opacity) - np.log1p(-opacity)
-    scales = np.log(np.maximum(splats.scales[rows].astype(np.float64), SMALLEST_SCALE))
+    scales = np.log(np.maximum(splats.scales.astype(np.float64), SMALLEST_SCALE))
     for axis, name in enumerate(SCALES):
         table[name] = scales[:, axis]
-    quats = splats.quats[rows]
     for i, name in enumerate(QUATS):
-        table[name] = quats[:, i]
+        table[name] = splats.quats[:, i]
     for name, values in ((OBJECT_ID, splats.object_ids), (UNOBSERVED, splats.unobserved)):
         if name in (dtype.names or ()):
-            table[name] = values[rows]
+            table[name] = values
     return table
+
+
+def _only_usable(splats: Splats) -> Splats:
+    keep = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
+    return splats if keep.all() else splats.select(keep)
 
 
 def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray, sh: NDArray) -> NDArray:
@@ -119,13 +146,29 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
     return keep
 
 
-def position_kind(splats: Splats) -> str:
-    """Return `f8` if float32 would change positions by more than 1e-6 of the splats' extent, otherwise `f4`."""
-    if len(splats) == 0 or splats.means.dtype != np.float64:
-        return "f4"
-    low, high = splats.means.min(0), splats.means.max(0)
-    extent = float((high - low).max() + splats.scales.max())
-    return "f8" if float(np.maximum(-low, high).max()) * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
+class Positions:
+    """The range of splats, which are added in parts, for the type of their positions in files."""
+
+    def __init__(self) -> None:
+        self._low, self._high, self._scale = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+        self._double = False
+
+    def add(self, splats: Splats) -> None:
+        """Extend the range by that of splats."""
+        if len(splats):
+            self._double |= splats.means.dtype == np.float64
+            self._low = np.minimum(self._low, splats.means.min(0))
+            self._high = np.maximum(self._high, splats.means.max(0))
+            self._scale = max(self._scale, float(splats.scales.max()))
+
+    @property
+    def kind(self) -> str:
+        """`f8` if float32 would change positions by more than 1e-6 of the splats' extent, otherwise `f4`."""
+        if not self._double:
+            return "f4"
+        extent = float((self._high - self._low).max()) + self._scale
+        largest = float(np.maximum(-self._low, self._high).max())
+        return "f8" if largest * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
 
 
 def rounding_warnings(path: Path, splats: Splats, step: float) -> list[str]:

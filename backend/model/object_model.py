@@ -113,21 +113,24 @@ class ObjectModel:
                 g.scales[:, 2] = DISC_THICKNESS * g.scales[:, :2].amin(1)
             return g
 
-    def splats(self, camera_center: np.ndarray | None = None) -> tuple[Splats, np.ndarray]:
-        """Convert the model to plain splats.
+    def splats(self, seen: torch.Tensor | None = None) -> tuple[Splats, np.ndarray]:
+        """Convert a view-independent model to plain splats.
 
         Args:
-            camera_center: (3,), the camera's center in scene units; required only if the model is view-dependent.
+            seen: (n,) int64, the anchors; None: all.
 
         Returns:
             Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.
         """
-        g = self.generate(camera_center=camera_center).cpu()
+        g = self.generate(seen).cpu()
         usable = _normalize(g.quats.numpy())
         g = g if usable.all() else g.select(torch.from_numpy(usable))
         means, quats, scales, opacities, sh, ids, source = (part.numpy() for part in g[:7])
         # Each array is freed when its conversion replaces it, since those of all splats are large.
         del g
+        if seen is not None:
+            anchor, offset = np.divmod(source, self.anchors.layout.offsets)
+            source = devices.host(seen)[anchor] * self.anchors.layout.offsets + offset
         means = converted(means, self.normalization.to_world)
         scales = converted(scales, lambda values: values.astype(np.float64) / self.normalization.scale)
         ids = converted(ids, self.classes.ids_of, np.int64)

@@ -73,8 +73,8 @@ class Splats:
             object_ids=np.zeros(0, np.int64),
         )
 
-    def select(self, mask: NDArray) -> Splats:
-        """Copy the splats selected by a boolean mask (N,) or by an array of indices, in that order."""
+    def select(self, mask: NDArray | slice) -> Splats:
+        """Return the splats selected by a boolean mask (N,), an array of indices, in that order, or a slice."""
         return Splats(
             self.means[mask],
             self.quats[mask],

@@ -15,6 +15,7 @@ from ..model.anchors import Anchors
 from ..model.checkpoint import Stored, Take, load_checkpoint
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
+from ..model.splats import gathered_columns
 from ..raster import devices
 from ..shared.class_table import ClassTable
 from ..shared.errors import InputError
@@ -33,7 +34,7 @@ Keep = Callable[[Anchors], np.ndarray]
 """Returns which of a block of anchors are kept, (n,) bool."""
 
 _BLOCK = 65536
-"""Number of anchors, or rows of a tensor, that are read at a time where not all are kept."""
+"""Number of anchors, or rows of a tensor, that are read at a time."""
 
 Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
@@ -188,28 +189,25 @@ def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None, with_
     # Fixed anchors, the first ones, have no mean.
     fixed = Region.of(state).fixed if "rows" in mean else count
     begin = 0 if with_fixed else Region.of(state).fixed
-    size = count if keep is None else _BLOCK
-    blocks = []
-    for first in range(begin, max(count, begin + 1), max(size, 1)):
-        last = min(first + size, count)
-        positions, ids = (stored.part(f"anchors.{name}", first, last) for name in ("positions", "ids"))
+
+    def block(first: int, last: int) -> dict[str, np.ndarray]:
+        read = {name: stored.part(f"anchors.{name}", first, last) for name in ("positions", "ids")}
         rows = [stored.part("anchors.rows", first, min(last, fixed))] if first < fixed or first == last else []
         if last > fixed:
             rows.append(stored.part(PREFIX + "rows", max(first - fixed, 0), last - fixed))
-        block = positions, _joined(rows), ids
+        read["rows"] = rows[0] if len(rows) == 1 else np.concatenate(rows)
         if keep is not None:
-            kept = keep(Anchors(layout, voxel, *map(torch.from_numpy, block)))
-            block = block[0][kept], block[1][kept], block[2][kept]
-        blocks.append(block)
-    of_anchors = dict(zip(("positions", "rows", "ids"), map(_joined, zip(*blocks, strict=True)), strict=True))
+            each = (torch.from_numpy(read[name]) for name in ("positions", "rows", "ids"))
+            kept = keep(Anchors(layout, voxel, *each))
+            read = {name: values[kept] for name, values in read.items()}
+        return read
+
+    starts = range(begin, max(count, begin + 1), _BLOCK)
+    of_anchors = gathered_columns((block(first, min(first + _BLOCK, count)) for first in starts), count - begin)
     return {
         **{name: stored[PREFIX + name if name in mean else name] for name in others},
         **{f"anchors.{name}": values for name, values in of_anchors.items()},
     }
-
-
-def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def load_model(

@@ -26,7 +26,7 @@ from backend.commands import votes
 from backend.commands.capture import check
 from backend.commands.setup.machine import set_threads
 from backend.commands.training import evaluate, render, report
-from backend.export import agreement, fit_splats, read_splats
+from backend.export import FittedSplats, agreement, fit_splats, read_splats
 from backend.labels import read_points
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint
 from backend.raster import devices
@@ -932,11 +932,12 @@ def test_fit_of_view_independent_model_is_exact(write_capture, tmp_path, run_com
     cameras = [trainer.scene.camera(i) for i in range(len(capture.views))]
     with torch.no_grad():
         model.heads.hidden.weight[:, -4:] *= 3.0
-    assert 20 < agreement(model, *fit_splats(model, cameras), cameras).psnr < 60
+    assert 20 < agreement(model, FittedSplats(model, *fit_splats(model, cameras)), cameras).psnr < 60
     with torch.no_grad():
         model.heads.hidden.weight[:, -4:] = 0.0
     splats, source = fit_splats(model, cameras)
-    assert agreement(model, splats, source, cameras).psnr > 60
+    fitted = FittedSplats(model, splats, source)
+    assert agreement(model, fitted, cameras).psnr > 60
     assert set(splats.object_ids.tolist()) <= {0, 1, 2, 5}
     monkeypatch.setattr("backend.export.fit._ANCHORS_AT_ONCE", 50)
     monkeypatch.setattr("backend.export.fit._SPLATS_AT_ONCE", 70)
@@ -945,4 +946,4 @@ def test_fit_of_view_independent_model_is_exact(write_capture, tmp_path, run_com
     assert (model.classes.ids_of(model.anchors.ids[source // 4].numpy()) == splats.object_ids).all()
     for name in ("means", "quats", "scales", "opacities", "sh", "object_ids"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(splats, name))
-    assert agreement(model, splats, source, []) is None
+    assert agreement(model, fitted, []) is None
