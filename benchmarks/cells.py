@@ -3,8 +3,9 @@
 
     python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 6000] [--seeds 0 1] [--json] [--write]
 
-The capture is one of benchmarks/aerial.py. Of the steps of the training in cells, some are those of the coarse model
-and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
+The capture is one of benchmarks/aerial.py. One training has as many anchors as it grows; the coarse model has at most a
+part of them, one for each cell, and each cell a little more, since cells overlap. Of the steps of the training in cells,
+some are those of the coarse model and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
 cells and in all others, for both models. Memory is measured on larger captures, too, in trainings of a few steps.
 --write saves the figures to docs/figures/cells.json, the text to docs/cells.md and pictures of the differences to
 docs/cells.png.
@@ -36,7 +37,11 @@ COARSE, SEAMS = 0.2, 0.05
 NEAR = 1.0
 """Distance in meters up to which a surface is near a cut."""
 
-_OPTIONS = ("--max-anchors", "100000000", "--leave-out", "dense-points")
+_LEFT_OUT = ("--leave-out", "dense-points")
+_UNLIMITED = ("--max-anchors", 10**8)
+
+_OF_CELL = 4 / 3
+"""Most anchors of a cell, relative to an equal part of those of one training."""
 
 _FEW = 100
 """Steps of trainings whose memory is measured."""
@@ -44,7 +49,7 @@ _FEW = 100
 _MEMORY_MB = 100
 """Memory for photos in these trainings, so that the models take most of it."""
 
-_COMMANDS = {"split": "split", "cell": "train-cell", "merge": "merge"}
+_COMMANDS = {"coarse": "coarse `train`", "split": "`split`", "cell": "`train-cell`", "merge": "`merge`"}
 
 _QUALITY = {"psnr": ("PSNR, dB", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "miou_all": ("mIoU", "{:.3f}")}
 
@@ -111,10 +116,13 @@ def measure(town: Path, photos: int, cells: int, steps: int, seed: int) -> dict[
     shared.forget(parts)
     coarse, seams = round(COARSE * steps), round(SEAMS * steps)
     of_cell = (steps - coarse - seams) // cells
-    of_one = _run("train", town, "--out", one, "--steps", steps, "--seed", seed, *_OPTIONS)
-    of_coarse = _run("train", town, "--out", parts, "--steps", coarse, "--seed", seed, *_OPTIONS)
+    words = ("train", town, "--seed", seed, *_LEFT_OUT)
+    of_one = _run(*words, "--out", one, "--steps", steps, *_UNLIMITED)
+    share = _export(one)["anchors"] / cells
+    of_coarse = _run(*words, "--out", parts, "--steps", coarse, "--max-anchors", round(share))
     of_split = _run("split", parts, "--cells", cells)
-    of_cells = [_run("train-cell", parts, "--cell", number, "--steps", of_cell) for number in range(cells)]
+    limited = ("--steps", of_cell, "--max-anchors", round(_OF_CELL * share))
+    of_cells = [_run("train-cell", parts, "--cell", number, *limited) for number in range(cells)]
     of_merge = _run("merge", parts, "--steps", steps - coarse - cells * of_cell)
     return {
         "one": {**of_one, **_quality(one)},
@@ -131,21 +139,30 @@ def measure(town: Path, photos: int, cells: int, steps: int, seed: int) -> dict[
 
 def measure_memory(town: Path, cells: int) -> dict[str, float]:
     """Train a few steps both ways; returns the number of anchors and splats, and the peak memory of each process."""
-    folder = WORK / "large"
+    folder, coarse = WORK / "large", WORK / "large-coarse"
     shared.forget(folder)
+    shared.forget(coarse)
     memory = ("--memory-mb", _MEMORY_MB)
-    whole = _run("train", town, "--out", folder, "--steps", _FEW, *memory, *_OPTIONS)
-    export = json.loads((folder / "objectgs.json").read_text())["export"]
-    parts = {"split": _run("split", folder, "--cells", cells, *memory)}
+    words = ("train", town, "--steps", _FEW, *memory, *_LEFT_OUT)
+    one = _run(*words, "--out", folder, *_UNLIMITED)
+    export = _export(folder)
+    parts = {"coarse": _run(*words, "--out", coarse, "--max-anchors", export["anchors"] // cells)}
+    # So few steps add no anchors, so the cells are those of the whole model instead of the coarse one.
+    parts["split"] = _run("split", folder, "--cells", cells, *memory)
     of_cells = [_run("train-cell", folder, "--cell", number, "--steps", _FEW, *memory) for number in range(cells)]
+    parts["cell"] = max(of_cells, key=lambda cell: cell["memory_gb"])
     parts["merge"] = _run("merge", folder, "--steps", _FEW, *memory)
     return {
         "anchors": export["anchors"],
         "splats": export["splats"],
-        "one": whole["memory_gb"],
-        "cell": max(cell["memory_gb"] for cell in of_cells),
+        "one": one["memory_gb"],
         **{name: part["memory_gb"] for name, part in parts.items()},
     }
+
+
+def _export(folder: Path) -> dict[str, Any]:
+    """Return the record of the export of a reconstruction."""
+    return json.loads((folder / "objectgs.json").read_text())["export"]
 
 
 def _run(*words: object) -> dict[str, float]:
@@ -175,8 +192,7 @@ def _quality(folder: Path) -> dict[str, float]:
     """Return the quality on the held-out views, and the number of anchors."""
     shared.run_backend("evaluate", folder)
     quality = json.loads((folder / "evaluation.json").read_text())["quality"]
-    anchors = json.loads((folder / "objectgs.json").read_text())["export"]["anchors"]
-    return {**{name: quality[name] for name in _QUALITY}, "anchors": anchors}
+    return {**{name: quality[name] for name in _QUALITY}, "anchors": _export(folder)["anchors"]}
 
 
 def _opened(folder: Path) -> tuple[Any, Any]:
@@ -250,7 +266,9 @@ def document(found: Mapping[str, Any]) -> str:
         ]  # fmt: skip
 
     ones = [run["one"] for run in runs]
-    of_cell = [max(cell["memory_gb"] for cell in run["cells"]) for run in runs]
+    of_parts = [
+        max(part["memory_gb"] for part in (run["coarse"], run["split"], *run["cells"], run["merge"])) for run in runs
+    ]
     change = [run["merged"]["psnr"] - run["one"]["psnr"] for run in runs]
     near = [run["differences"] for run in runs]
     lines = [
@@ -258,18 +276,21 @@ def document(found: Mapping[str, Any]) -> str:
         "",
         f"Made by `python benchmarks/cells.py --write`: {found['photos']} aerial photos of 320 x 240 pixels, trained "
         f"with {found['steps']:,} steps, and as {found['cells']} cells with as many steps together, those of the "
-        f"coarse model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included, without a limit of anchors"
+        f"coarse model ({COARSE:.0%}) and of the seams ({SEAMS:.0%}) included. The one training has no limit of "
+        f"anchors; the coarse model has at most 1/{found['cells']} of its anchors, and a cell at most "
+        f"{_OF_CELL / found['cells']:.0%}"
         + (f"; mean and standard deviation over {len(runs)} seeds." if len(runs) > 1 else ", one seed."),
         "",
         *shared.table(
-            ["", "steps", "anchors", *(title for title, _ in _QUALITY.values()), "memory of a process, GB"],
+            ["", "steps", "anchors", *(title for title, _ in _QUALITY.values()), "peak memory, GB"],
             [
                 row("one training", found["steps"], [one["memory_gb"] for one in ones], ones),
-                row("cells", found["steps"], of_cell, [run["merged"] for run in runs]),
+                row("cells", found["steps"], of_parts, [run["merged"] for run in runs]),
             ],
         ),
         "",
-        f"The cells' PSNR is {shared.spread(change, '{:+.2f}')} dB relative to that of one training.",
+        f"The cells' PSNR is {shared.spread(change, '{:+.2f}')} dB relative to that of one training. Here, most of the "
+        "memory is that for photos (`--memory-mb`), which is the same in each process.",
         "",
         f"Mean squared differences to the held-out photos, for surfaces within {NEAR:g} m of a cut between cells "
         f"({statistics.fmean(d['pixels_near'] for d in near):.0%} of the pixels) and elsewhere:",
@@ -290,10 +311,11 @@ def document(found: Mapping[str, Any]) -> str:
         "",
         f"The most memory that processes took in {_FEW} steps on {found['large_photos']:,} such photos, in GB and "
         f"relative to one training, with `--memory-mb {_MEMORY_MB}` for the photos. Of it, {found['idle']:.2f} GB are "
-        "taken by Python and its packages before anything is read:",
+        "taken by Python and its packages before anything is read. The coarse model has "
+        f"1/{found['cells']} of the anchors:",
         "",
         *shared.table(
-            ["anchors", "splats", "one training", *(f"`{title}`" for title in _COMMANDS.values())],
+            ["anchors", "splats", "one training", *_COMMANDS.values()],
             [
                 [
                     f"{large['anchors']:,}", f"{large['splats']:,}", f"{large['one']:.2f}",

@@ -11,7 +11,7 @@ from ..model.splats import blocks
 from ..raster import devices
 from ..shared.formats.anchors_ply import AnchorTable, write_anchor_tables
 from .model_splats import ModelSplats
-from .ply import Positions
+from .ply import PositionRange, only_usable
 
 
 def write_anchors(path: Path, model: ObjectModel, splats: ModelSplats) -> None:
@@ -27,12 +27,12 @@ def write_anchors(path: Path, model: ObjectModel, splats: ModelSplats) -> None:
     anchors = model.anchors
     count, k = len(anchors), anchors.layout.offsets
     numbers, opacities = np.zeros(count, np.int64), np.zeros(count)
-    positions = Positions()
+    positions = PositionRange()
     for part, source in splats.parts():
         owner = source // k
         np.add.at(numbers, owner, 1)
         np.add.at(opacities, owner, part.opacities)
-        positions.add(part)
+        positions.add(only_usable(part))
     opacities /= np.maximum(numbers, 1)
 
     def table(rows: slice) -> AnchorTable:

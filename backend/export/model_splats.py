@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..model.object_model import ObjectModel
-from ..model.splats import ROWS_AT_ONCE, Splats
+from ..model.splats import Splats, some_blocks
 from ..raster import devices
 
 
@@ -41,10 +41,9 @@ class ExactSplats:
 
     def parts(self) -> Iterator[Part]:
         """As in `ModelSplats`."""
-        count = len(self._model.anchors)
-        size = max(ROWS_AT_ONCE // self._model.anchors.layout.offsets, 1)
-        for start in range(0, max(count, 1), size):
-            yield self.of(torch.arange(start, min(start + size, count), device=self._model.device))
+        anchors = self._model.anchors
+        for rows in some_blocks(len(anchors), anchors.layout.offsets):
+            yield self.of(torch.arange(rows.start, rows.stop, device=self._model.device))
 
     def of(self, anchors: torch.Tensor) -> Part:
         """As in `ModelSplats`."""
@@ -59,7 +58,9 @@ class FittedSplats:
 
     def parts(self) -> Iterator[Part]:
         """As in `ModelSplats`."""
-        yield self._all
+        splats, source = self._all
+        for rows in some_blocks(len(splats)):
+            yield Part(splats.select(rows), source[rows])
 
     def of(self, anchors: torch.Tensor) -> Part:
         """As in `ModelSplats`."""

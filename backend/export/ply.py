@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.splats import Splats, blocks
+from ..model.splats import Splats, blocks, some_blocks
 from ..shared.class_table import LARGEST_ID
 from ..shared.formats.ply import write_vertex_blocks
 from ..shared.formats.splat_ply import (
@@ -56,7 +56,7 @@ def write_splats(
     Raises:
         ValueError: An object ID is not in 0 .. 2^32 - 1.
     """
-    parts = [splats.select(rows) for rows in blocks(len(splats))] or [splats]
+    parts = [splats.select(rows) for rows in some_blocks(len(splats))]
     return write_splat_parts(path, lambda: parts, with_ids, background)[1]
 
 
@@ -70,7 +70,7 @@ def write_splat_parts(
 
     Args:
         path, with_ids, background: As for `write_splats`.
-        make: Returns the splats in parts, at least one, the same each time; called twice.
+        make: Returns the splats in parts, at least one, the same each time; called twice. All have the same degree.
 
     Returns:
         The number of splats in the file, and warnings about those that were left out.
@@ -79,10 +79,10 @@ def write_splat_parts(
         ValueError: As from `write_splats`.
     """
     path, total, count, degree, some_unobserved = Path(path), 0, 0, 0, False
-    positions = Positions()
+    positions = PositionRange()
     for part in make():
         total, degree = total + len(part), part.degree
-        part = _only_usable(part)
+        part = only_usable(part)
         if len(part) and (part.object_ids.min() < 0 or part.object_ids.max() > LARGEST_ID):
             raise ValueError("object IDs must be from 0 to 2^32 - 1")
         positions.add(part)
@@ -99,13 +99,13 @@ def write_splat_parts(
         names.append(UNOBSERVED)
     dtype = splat_dtype(names, positions.kind)
     comments = [background_comment(background)] if background else []
-    write_vertex_blocks(path, dtype, count, (_rows(_only_usable(part), dtype) for part in make()), comments)
+    write_vertex_blocks(path, dtype, count, (_rows(only_usable(part), dtype) for part in make()), comments)
     return count, warnings
 
 
 def splat_table(splats: Splats) -> NDArray:
     """Return all splats as the records of `write_splats`, always with IDs and `unobserved`."""
-    positions = Positions()
+    positions = PositionRange()
     positions.add(splats)
     return _rows(splats, splat_dtype([*property_names(splats.degree), UNOBSERVED], positions.kind))
 
@@ -131,7 +131,8 @@ def _rows(splats: Splats, dtype: np.dtype) -> NDArray:
     return table
 
 
-def _only_usable(splats: Splats) -> Splats:
+def only_usable(splats: Splats) -> Splats:
+    """Return the splats that `write_splats` does not leave out."""
     keep = _usable(splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     return splats if keep.all() else splats.select(keep)
 
@@ -146,8 +147,8 @@ def _usable(means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray,
     return keep
 
 
-class Positions:
-    """The range of splats, which are added in parts, for the type of their positions in files."""
+class PositionRange:
+    """The range of splats, which are added in parts; from it follows the type of x, y and z in files."""
 
     def __init__(self) -> None:
         self._low, self._high, self._scale = np.full(3, np.inf), np.full(3, -np.inf), 0.0

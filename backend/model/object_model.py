@@ -121,6 +121,9 @@ class ObjectModel:
 
         Returns:
             Splats in world units, and source (N,) int64: anchor * offsets + offset of each splat.
+
+        Raises:
+            ValueError: The model is view-dependent.
         """
         g = self.generate(seen).cpu()
         usable = _normalize(g.quats.numpy())

@@ -73,16 +73,16 @@ class Splats:
             object_ids=np.zeros(0, np.int64),
         )
 
-    def select(self, mask: NDArray | slice) -> Splats:
-        """Return the splats selected by a boolean mask (N,), an array of indices, in that order, or a slice."""
+    def select(self, rows: NDArray | slice) -> Splats:
+        """Return the splats selected by a boolean mask (N,), by indices, in that order, or by a slice, not copied."""
         return Splats(
-            self.means[mask],
-            self.quats[mask],
-            self.scales[mask],
-            self.opacities[mask],
-            self.sh[mask],
-            self.object_ids[mask],
-            self.unobserved[mask],
+            self.means[rows],
+            self.quats[rows],
+            self.scales[rows],
+            self.opacities[rows],
+            self.sh[rows],
+            self.object_ids[rows],
+            self.unobserved[rows],
         )
 
     def with_degree(self, degree: int) -> Splats:
@@ -122,7 +122,12 @@ def gathered(parts: Iterable[Splats], most: int) -> Splats:
 
 
 def gathered_columns(parts: Iterable[Mapping[str, NDArray]], most: int) -> dict[str, NDArray]:
-    """Concatenate arrays of the same names, lengths and types, as `gathered` does."""
+    """Concatenate arrays while they are made, as `gathered` does.
+
+    Args:
+        parts: one or more; all have the same names, and the arrays of a part the same number of rows.
+        most: upper bound of the number of rows of the result.
+    """
     whole: dict[str, NDArray] = {}
     count = 0
     for part in parts:
@@ -132,12 +137,19 @@ def gathered_columns(parts: Iterable[Mapping[str, NDArray]], most: int) -> dict[
                 whole[name] = np.empty((most, *values.shape[1:]), values.dtype)
             whole[name][count : count + length] = values
         count += length
-    return {name: values[:count] for name, values in whole.items()}
+    # On Windows, addresses count as memory, so that little of many is copied.
+    return {name: values[:count].copy() if 2 * count < most else values[:count] for name, values in whole.items()}
 
 
-def blocks(count: int) -> Iterator[slice]:
-    """Divide `count` rows into blocks of at most ROWS_AT_ONCE."""
-    return (slice(start, min(start + ROWS_AT_ONCE, count)) for start in range(0, count, ROWS_AT_ONCE))
+def blocks(count: int, each: int = 1) -> Iterator[slice]:
+    """Divide `count` rows, which have `each` splats, into blocks of at most ROWS_AT_ONCE splats."""
+    size = max(ROWS_AT_ONCE // each, 1)
+    return (slice(start, min(start + size, count)) for start in range(0, count, size))
+
+
+def some_blocks(count: int, each: int = 1) -> list[slice]:
+    """Return the `blocks`, or an empty one if there are no rows."""
+    return list(blocks(count, each)) or [slice(0, 0)]
 
 
 def converted(values: NDArray, convert: Callable[[NDArray], NDArray], kind: DTypeLike = np.float64) -> NDArray:

@@ -168,7 +168,8 @@ def read_result(
     Args:
         folder: The folder of the checkpoint.
         keep: Chooses among a block of the anchors those that are kept in memory; None: all.
-        fixed: Whether anchors that the training did not change are read, too.
+        fixed: Whether anchors that the training did not change are read, too; without them, the state still tells
+            how many there are.
 
     Returns:
         The tensors, as in a checkpoint, of the mean of the model over the latest steps, the state, and a warning or
@@ -186,16 +187,18 @@ def _take_result(stored: Stored, state: dict[str, Any], keep: Keep | None, with_
     others = [name for name in stored if not name.startswith(("adam.", "growth.", "anchors.", PREFIX))]
     layout, voxel = Settings(**state["settings"]).layout, float(state["voxel"])
     count = len(stored["anchors.ids"])
+    fixed = Region.of(state).fixed
     # Fixed anchors, the first ones, have no mean.
-    fixed = Region.of(state).fixed if "rows" in mean else count
-    begin = 0 if with_fixed else Region.of(state).fixed
+    without_mean = fixed if "rows" in mean else count
+    begin = 0 if with_fixed else fixed
 
     def block(first: int, last: int) -> dict[str, np.ndarray]:
         read = {name: stored.part(f"anchors.{name}", first, last) for name in ("positions", "ids")}
-        rows = [stored.part("anchors.rows", first, min(last, fixed))] if first < fixed or first == last else []
-        if last > fixed:
-            rows.append(stored.part(PREFIX + "rows", max(first - fixed, 0), last - fixed))
-        read["rows"] = rows[0] if len(rows) == 1 else np.concatenate(rows)
+        middle = min(max(first, without_mean), last)
+        rows = [stored.part("anchors.rows", first, middle)]
+        if middle < last:
+            rows.append(stored.part(PREFIX + "rows", middle - without_mean, last - without_mean))
+        read["rows"] = np.concatenate(rows)
         if keep is not None:
             each = (torch.from_numpy(read[name]) for name in ("positions", "rows", "ids"))
             kept = keep(Anchors(layout, voxel, *each))

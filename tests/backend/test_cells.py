@@ -25,11 +25,11 @@ from backend.shared.reconstruction.lock import locked
 from backend.training.cells.division import NO_CELL, Cell, Division, divide, read_division, write_division
 from backend.training.cells.parts import (
     anchors_of,
-    around_seams,
     begin_cell,
     begin_seams,
-    core_of,
+    in_core,
     merged,
+    near_seams,
     shown,
     trained_in,
     without_anchors,
@@ -153,8 +153,12 @@ def test_cell_changes_its_own_anchors_only(tiny, tmp_path, mode, monkeypatch):
     ]
     for name, value in every.items():
         assert np.array_equal(some[name], value[kept] if name.startswith("anchors.") else value), name
-    none = read_result(tmp_path / "cell", lambda block: np.zeros(len(block), bool))[0]
-    assert none["anchors.rows"].shape == (0, every["anchors.rows"].shape[1])
+    own = read_result(tmp_path / "cell", fixed=False)[0]
+    for name, value in every.items():
+        assert np.array_equal(own[name], value[fixed:] if name.startswith("anchors.") else value), name
+    for with_fixed in (True, False):
+        none = read_result(tmp_path / "cell", lambda block: np.zeros(len(block), bool), with_fixed)[0]
+        assert none["anchors.rows"].shape == (0, every["anchors.rows"].shape[1])
     assert float(again.step(0.5)) == float(trainer.step(0.5)), "it goes on exactly as it would have"
 
 
@@ -200,15 +204,18 @@ def test_parts_that_are_not_trained_merge_to_the_coarse_model(tiny, tmp_path):
     assert not {name for name in coarse[0] if name.startswith("anchors.")}
 
     def read(keep):
-        found = [read_result(tmp_path / str(n), keep(n), fixed=False)[:2] for n in range(2)]
+        found = [read_result(tmp_path / str(number), keep(number), fixed=False)[:2] for number in range(2)]
         return [anchors_of(checkpoint) for checkpoint in found]
 
-    count, cores = len(expected["ids"]), read(lambda n: core_of(division, n))
+    count, cores = len(expected["ids"]), read(lambda number: in_core(division, number))
     assert [len(core["ids"]) for core in cores] == [int((cell_of == number).sum()) for number in range(2)]
-    near = read(lambda n: around_seams(division, n, cameras))
-    seams = begin_seams(coarse, division, of_none, near, count, cameras)
-    on_seams = len(seams[0]["anchors.ids"]) - Region.of(seams[1]).fixed
-    assert 0 < on_seams < count / 2
+    for chosen_for in ([], cameras):
+        near = near_seams(division, chosen_for)
+        chosen = read(lambda number, near=near: lambda block: in_core(division, number)(block) & near(block))
+        seams = begin_seams(coarse, division, of_none, chosen, count, chosen_for)
+        on_seams = len(seams[0]["anchors.ids"]) - Region.of(seams[1]).fixed
+        assert 0 < on_seams < count / 2
+        assert len(seams[0]["anchors.ids"]) == (count if chosen_for else on_seams), "others are not even read"
     save_checkpoint(tmp_path / "seams", *seams)
     seams = read_result(tmp_path / "seams", fixed=False)[:2]
     assert len(seams[0]["anchors.ids"]) == on_seams
@@ -402,9 +409,13 @@ def test_damaged_files_of_cells_are_named(divided, run_command):
     assert_rejected(run_command("merge", divided), "run `train-cell` for this cell again")
     assert run_command("train-cell", divided, "--cell", 0, "--steps", 3).code == EXIT_DONE
     assert run_command("merge", divided).code == EXIT_DONE, "what the message says has helped"
+    shutil.rmtree(divided / "cells" / "seams")
     part = divided / "cells" / "1" / "part.json"
     part.write_text(json.dumps({**json.loads(part.read_text()), "anchors": 1}))
-    assert_rejected(run_command("merge", divided), "anchors instead of 1", "--restart")
+    assert_rejected(run_command("merge", divided), "instead of 1", "run `train-cell`")
+    assert not list((divided / "cells" / "seams").rglob(CURRENT)), "it is noticed before anything is trained"
+    assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE
+    assert run_command("merge", divided).code == EXIT_DONE, "what the message says has helped"
 
 
 def test_damaged_model_is_not_divided(divided, run_command):
@@ -451,7 +462,8 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
                 assert len(found.model.anchors) == 0
             elif arguments[0].name == "coarse":
                 kept.append(len(found[0]["anchors.ids"]))
-                coarse.extend(weakref.ref(value) for key, value in found[0].items() if key.startswith("anchors."))
+                of_anchors = (value for key, value in found[0].items() if key.startswith("anchors."))
+                coarse.extend(weakref.ref(value if value.base is None else value.base) for value in of_anchors)
             return found
 
         monkeypatch.setattr(opening, name, wrapper)
@@ -477,7 +489,8 @@ def test_cell_keeps_to_its_folder_and_to_what_it_needs(divided, divided_once, tm
     coarse.clear()
     assert run_command("train-cell", divided, "--cell", 1, "--steps", 3).code == EXIT_DONE and not coarse
     monkeypatch.setattr(Trainer, "restore", whole)
-    assert run_command("merge", divided).code == EXIT_DONE
+    result = run_command("merge", divided, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["anchors"] > 100
     assert kept[-1] < 0.1 * anchors < kept[0] <= anchors, "merging needs only the anchors that belong to no cell"
 
 

@@ -13,7 +13,8 @@ import torch
 
 from backend.commands.exported import export_model
 from backend.commands.training import train
-from backend.model.anchors import Layout, seed_anchors
+from backend.export import ExactSplats, FittedSplats
+from backend.model.anchors import Anchors, Layout, seed_anchors
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, ObjectModel
 from backend.raster import Camera
@@ -56,17 +57,46 @@ def export(model: ObjectModel, out: Path, focal: float = 64.0) -> Reconstruction
     return Reconstruction(out)
 
 
-@pytest.mark.parametrize(("focal", "most"), [(2000.0, 165), (64.0, 330)], ids=["few in view", "all in view"])
-def test_export_takes_little_more_than_the_splats(tmp_path, monkeypatch, focal, most):
-    monkeypatch.setattr(BLOCK, 1 << 12)
+@pytest.mark.parametrize(("focal", "most"), [(2000.0, 20), (64.0, 260)], ids=["few in view", "all in view"])
+def test_export_takes_little_memory(tmp_path, monkeypatch, focal, most):
+    monkeypatch.setattr(BLOCK, 1 << 11)
     model = model_of(20_000)
     export(model_of(100), tmp_path / "small")  # loads the kernels
     tracemalloc.start()
     folder = export(model, tmp_path / "large", focal)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    # A splat takes 125 bytes in `Splats`, 8 for its source, and 108 in the file.
+    # All splats would take 133 bytes each; only those in view are compared with the model.
     assert peak < most * len(read_vertices(folder.splats))
+
+
+@pytest.mark.parametrize("primitive", ["3d", "2d"])
+def test_parts_are_all_splats(monkeypatch, primitive):
+    model = model_of(300, "explicit", primitive)
+    model.anchors.rows[[7, 200], model.anchors.layout.shape_columns] = torch.nan
+    splats, source = model.splats()
+    chosen = torch.tensor([2, 7, 150, 299])
+    expected = np.isin(source // 10, chosen)
+    monkeypatch.setattr(BLOCK, 37)
+    for made in (ExactSplats(model), FittedSplats(model, splats, source)):
+        parts = list(made.parts())
+        assert max(len(part.source) for part in parts) <= 37
+        assert np.array_equal(np.concatenate([part.source for part in parts]), source)
+        of_chosen, none = made.of(chosen), made.of(chosen[:0])
+        assert np.array_equal(of_chosen.source, source[expected]) and len(none.splats) == len(none.source) == 0
+        for name, values in vars(splats).items():
+            found = np.concatenate([getattr(part.splats, name) for part in parts])
+            np.testing.assert_array_equal(found, values, name)
+            np.testing.assert_array_equal(getattr(of_chosen.splats, name), values[expected], name)
+
+
+@pytest.mark.parametrize("mode", ["explicit", "view"])
+def test_model_without_anchors_is_exported(tmp_path, mode):
+    model = model_of(4, mode)
+    anchors = model.anchors
+    model.anchors = Anchors(anchors.layout, anchors.voxel, anchors.positions[:0], anchors.rows[:0], anchors.ids[:0])
+    folder = export(model, tmp_path / "out")
+    assert len(read_vertices(folder.splats)) == len(read_anchor_table(folder.anchors)) == 0
 
 
 @pytest.mark.parametrize("mode", ["explicit", "view"])

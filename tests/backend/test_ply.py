@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from backend.export import read_splats, write_splats
+from backend.export import read_splats, write_splat_parts, write_splats
 from backend.model.splats import Splats, concatenate
 from backend.shared.errors import InputError
 from backend.shared.formats.ply import read_vertices, write_vertices
@@ -171,6 +171,23 @@ def test_nonfinite_splats_are_not_written(tmp_path, name, value):
     warnings = write_splats(tmp_path / "a.ply", splats)
     assert len(warnings) == 1 and "1 of 4" in warnings[0]
     assert np.array_equal(read_splats(tmp_path / "a.ply")[0].object_ids, splats.object_ids[[0, 1, 3]])
+
+
+def test_parts_are_written_as_the_whole(tmp_path):
+    splats = some_splats(n=9, dtype=np.float64)
+    splats.means += 1e6
+    splats.unobserved[8] = True
+    splats.quats[3:5] = 0
+    expected = write_splats(tmp_path / "whole.ply", splats)
+    parts = [splats.select(slice(*ends)) for ends in ((0, 3), (3, 3), (3, 5), (5, 9))]
+    count, warnings = write_splat_parts(tmp_path / "whole-in-parts.ply", lambda: parts)
+    assert count == 7 and warnings == [sentence.replace("whole.ply", "whole-in-parts.ply") for sentence in expected]
+    assert (tmp_path / "whole-in-parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    passes = iter([parts, parts[:3]])
+    before = (tmp_path / "whole.ply").read_bytes()
+    with pytest.raises(ValueError, match="7 vertices, not 3"):
+        write_splat_parts(tmp_path / "whole.ply", lambda: next(passes))
+    assert (tmp_path / "whole.ply").read_bytes() == before
 
 
 def test_ids_beyond_32_bits_are_rejected(tmp_path):

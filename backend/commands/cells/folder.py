@@ -3,7 +3,7 @@
 cells.json               the division, see `backend.training.cells.division`
 coarse/                  the checkpoint that was divided
 0/, 1/, ...              one folder a cell: checkpoint/, and part.json, which tells how far its training is
-seams/                   the same of the seams between the joined cells
+seams/                   the same of the seams between the cells
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ..folder import open_trained, require_reconstruction, with_corrected_masks
 CHECKPOINT = "checkpoint"
 """Name of the folder of a part's checkpoints in that of the part."""
 
-_RECORD = "part.json"
+RECORD = "part.json"
 
 
 class CellFolders:
@@ -197,7 +197,7 @@ def require_unchanged(folder: Reconstruction, division: Division, folders: CellF
 
 def digest_of(folder: Path) -> str:
     """Return a hash of the checkpoint in a folder of cells/; raise InputError if it is missing."""
-    if not (folder / CURRENT).exists():
+    if not (folder / CURRENT).is_file():
         raise _damaged(folder)
     return _digest(folder / CURRENT)
 
@@ -224,7 +224,7 @@ class PartRecord:
 
 def write_part_record(folder: Path, record: PartRecord) -> None:
     """Write part.json of a folder of cells/."""
-    write_json(folder / _RECORD, {**asdict(record), "made_of": list(record.made_of)})
+    write_json(folder / RECORD, {**asdict(record), "made_of": list(record.made_of)})
 
 
 def read_part_record(folder: Path) -> PartRecord | None:
@@ -233,7 +233,7 @@ def read_part_record(folder: Path) -> PartRecord | None:
     Raises:
         InputError: the file is damaged.
     """
-    path = folder / _RECORD
+    path = folder / RECORD
     if not path.exists():
         return None
     try:

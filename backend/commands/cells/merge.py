@@ -6,9 +6,11 @@ import argparse
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from ...model.anchors import Anchors
 from ...model.checkpoint import save_checkpoint
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
@@ -21,10 +23,10 @@ from ...training.cells.division import NO_CELL
 from ...training.cells.parts import (
     Checkpoint,
     anchors_of,
-    around_seams,
     begin_seams,
-    core_of,
+    in_core,
     merged,
+    near_seams,
     without_anchors,
 )
 from ...training.state import Keep, model_from_checkpoint, progress_of
@@ -36,6 +38,7 @@ from ..setup.kernels import ensure_kernels, kernel_seconds
 from ..stages import finish_stage
 from .folder import (
     CHECKPOINT,
+    RECORD,
     Divided,
     PartRecord,
     digest_of,
@@ -68,37 +71,44 @@ def merge(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     with locked(folder.folder):
         divided = open_divided(options, reporter)
         require_unchanged(folder, divided.division, divided.folders)
-        reporter.expect({KERNELS: ("Preparing", kernel_seconds(divided.device))})
-        ensure_kernels(reporter, divided.device)
         with divided.folders.locked():
-            tensors, state = _merge(divided, options, reporter)
+            tensors, state, seconds = _merge(divided, options, reporter)
         save_checkpoint(folder.checkpoint, tensors, state)
         outdate_results(folder)
         progress = progress_of(state)
         update_record(folder, training=replace(divided.training, steps=progress.step, minutes=None, preset=None))
+        finish_stage(folder, "merge", seconds)
         model = model_from_checkpoint(tensors, state).to(divided.device)
+        del tensors
         export_model(model, divided.scene, folder, reporter)
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(model.anchors), splats=str(folder.splats)
     )
 
 
-def _merge(divided: Divided, options: argparse.Namespace, reporter: StoppingReporter) -> Checkpoint:
-    """Return the checkpoint of the whole model, after its seams are trained.
+def _merge(
+    divided: Divided, options: argparse.Namespace, reporter: StoppingReporter
+) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
+    """Return the tensors and the state of the whole model, after the training of the seams, and the seconds of that.
 
     The cells are read twice, so that not all of them are in memory while the seams are trained.
     """
+    division = divided.division
     cells = _finished_cells(divided)
+    reporter.expect({KERNELS: ("Preparing", kernel_seconds(divided.device))})
+    ensure_kernels(reporter, divided.device)
     coarse, _ = divided.read_coarse(lambda _, cell_of: cell_of == NO_CELL)
     of_none, shared = anchors_of(coarse), without_anchors(coarse)
+    del coarse
     most = len(of_none["ids"]) + sum(cell.anchors for cell in cells)
     steps = options.steps or min(max(round(_FRACTION * sum(cell.steps for cell in cells)), 1), _MOST)
 
     def begin() -> Checkpoint:
         reporter.begin(_SEAMS, "Reading the anchors where cells meet")
-        cameras = divided.cameras(divided.division.seam_views)
-        near = (_read_cell(divided, n, around_seams(divided.division, n, cameras)) for n in range(len(cells)))
-        return begin_seams(shared, divided.division, of_none, near, most, cameras)
+        cameras = divided.cameras(division.seam_views)
+        near = near_seams(division, cameras)
+        cores = (_read_core(divided, number, cell.anchors, near) for number, cell in enumerate(cells))
+        return begin_seams(shared, division, of_none, cores, most, cameras)
 
     seams = _train_seams(divided, begin, steps, options, reporter)
     progress = TrainingProgress(
@@ -108,26 +118,32 @@ def _merge(divided: Divided, options: argparse.Namespace, reporter: StoppingRepo
     )
     reporter.begin(_JOIN, f"Joining {len(cells)} cells")
     trained = read_part(divided.folders.seams / CHECKPOINT, fixed=False)
-    cores = (_read_core(divided, n, cell.anchors) for n, cell in enumerate(cells))
-    checkpoint = merged(shared, divided.division, of_none, cores, most, trained, progress, divided.key)
-    finish_stage(divided.folder, "merge", seams.seconds)
-    return checkpoint
+    cores = (_read_core(divided, number, cell.anchors) for number, cell in enumerate(cells))
+    return *merged(shared, division, of_none, cores, most, trained, progress, divided.key), seams.seconds
 
 
-def _read_core(divided: Divided, number: int, count: int) -> dict[str, np.ndarray]:
-    """Return the anchors in the core of a cell; raise InputError if there are not `count` of them."""
-    core = _read_cell(divided, number, core_of(divided.division, number))
-    if len(core["ids"]) != count:
+def _read_core(divided: Divided, number: int, count: int, keep: Keep | None = None) -> dict[str, np.ndarray]:
+    """Return the anchors in the core of a trained cell that `keep` chooses, by default all.
+
+    Raises:
+        InputError: there are not `count` of them in all, or the checkpoint is missing or damaged.
+    """
+    is_core, found = in_core(divided.division, number), 0
+
+    def choose(anchors: Anchors) -> np.ndarray:
+        nonlocal found
+        core = is_core(anchors)
+        found += int(core.sum())
+        return core if keep is None else core & keep(anchors)
+
+    folder = divided.folders.cell(number)
+    read = anchors_of(read_part(folder / CHECKPOINT, choose, fixed=False))
+    if found != count:
         raise InputError(
-            f"{divided.folders.cell(number)} has {len(core['ids'])} anchors instead of {count}; run `train-cell` with "
-            "--restart for this cell."
+            f"{folder / CHECKPOINT} has {found} anchors in the core of the cell instead of {count}, so it is not that "
+            f"of {folder / RECORD}; run `train-cell` for this cell again."
         )
-    return core
-
-
-def _read_cell(divided: Divided, number: int, keep: Keep) -> dict[str, np.ndarray]:
-    """Return anchors that a cell has trained."""
-    return anchors_of(read_part(divided.folders.cell(number) / CHECKPOINT, keep, fixed=False))
+    return read
 
 
 def _finished_cells(divided: Divided) -> list[PartRecord]:

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from ...capture import Capture, load_capture
-from ...export import read_splats
+from ...export import ExactSplats, read_splats
 from ...model.generate import Generated
 from ...model.object_model import Normalization
 from ...model.splats import Splats
@@ -108,7 +108,9 @@ def _of_training(trained: Trained) -> Pointable:
             f"{trained.folder.folder} has a view-dependent model; train it with --mode explicit to label it."
         )
     splats = model.generate()
-    in_file = np.isin(devices.host(splats.source), model.splats()[1])
+    # In the same parts as the file was written in, whose rounding may depend on them.
+    written = np.concatenate([part.source for part in ExactSplats(model).parts()])
+    in_file = np.isin(devices.host(splats.source), written)
     views = views_of_photos(trained.capture, scene.camera, scene.normalization)
     return Pointable(trained.folder, trained, splats, in_file, model.primitive, views, trained.capture)
 

@@ -96,4 +96,4 @@ def peak_mb() -> float:
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / 1e6 if sys.platform == "darwin" else peak / 1e3, 1)
+    return round(peak * (1 if sys.platform == "darwin" else 1024) / 1e6, 1)

@@ -56,12 +56,19 @@ def write_vertex_blocks(
         count: Number of vertices.
         blocks: Structured arrays of this type, which have `count` vertices together.
         comments: Comments of the header.
+
+    Raises:
+        ValueError: They have another number of vertices; the file is not written.
     """
     packed = np.dtype([(name, dtype[name].newbyteorder("<")) for name in dtype.names or ()])
     with atomic_file(path) as file:
         file.write(vertex_header(packed, count, comments))
+        written = 0
         for block in blocks:
             file.write(np.ascontiguousarray(block.astype(packed, copy=False)).data)
+            written += len(block)
+        if written != count:
+            raise ValueError(f"{path} was to have {count} vertices, not {written}")
 
 
 def read_vertices(path: Path, text: bool = False) -> np.ndarray:

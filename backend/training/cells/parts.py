@@ -55,22 +55,20 @@ def shown(anchors: Anchors, cameras: Iterable[Camera]) -> np.ndarray:
 
 
 def begin_part(
-    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, around: np.ndarray, bounds: Bounds,
-    seed: Sequence[int],
+    shared: Checkpoint, anchors: dict[str, np.ndarray], trained: np.ndarray, bounds: Bounds, seed: Sequence[int]
 ) -> Checkpoint:  # fmt: skip
     """Return the checkpoint from which a part of a model is trained.
 
     Args:
         shared: checkpoint of the coarse model, of whose anchors nothing is used.
         anchors: anchors, as from `anchors_of`.
-        trained: (n,) bool, those of the part.
-        around: (n,) bool, those that its views show; unless they are trained, they stay fixed. Others are left out.
+        trained: (n,) bool, those of the part; the others stay fixed.
         bounds: where anchors may be added.
         seed: of the random numbers.
     """
     tensors, state = shared
     settings = Settings(**state["settings"])
-    order = np.concatenate([np.flatnonzero(around & ~trained), np.flatnonzero(trained)])
+    order = np.concatenate([np.flatnonzero(~trained), np.flatnonzero(trained)])
     fixed = len(order) - int(trained.sum())
     made = _untrained(tensors, {name: anchors[name][order] for name in _OF_ANCHORS}, fixed, settings)
     rng = np.random.default_rng([settings.seed, *seed])
@@ -95,18 +93,17 @@ def begin_cell(coarse: Checkpoint, division: Division, number: int, cell_of: np.
     """
     anchors = anchors_of(coarse)
     trained = trained_in(division, number, anchors["positions"], cell_of)
-    return begin_part(coarse, anchors, trained, ~trained, division.cells[number].bounds, (number,))
+    return begin_part(coarse, anchors, trained, division.cells[number].bounds, (number,))
 
 
-def core_of(division: Division, number: int) -> Keep:
-    """Return which anchors of a trained cell the merged model has, for `read_result` without fixed ones."""
+def in_core(division: Division, number: int) -> Keep:
+    """Return what chooses, of the anchors that a cell has trained, those that the merged model has."""
     return lambda anchors: inside(anchors.positions.numpy(), division.cells[number].core)
 
 
-def around_seams(division: Division, number: int, cameras: Sequence[Camera]) -> Keep:
-    """Return which of these are on seams or shown by the cameras, which are those that show seams."""
-    is_core = core_of(division, number)
-    return lambda anchors: is_core(anchors) & (division.on_seams(anchors.positions.numpy()) | shown(anchors, cameras))
+def near_seams(division: Division, cameras: Sequence[Camera]) -> Keep:
+    """Return what chooses the anchors that are on seams or in view of the cameras, which are those that show seams."""
+    return lambda anchors: division.on_seams(anchors.positions.numpy()) | shown(anchors, cameras)
 
 
 def begin_seams(
@@ -123,8 +120,8 @@ def begin_seams(
         shared: checkpoint of the coarse model, of whose anchors nothing is used.
         division: the cells.
         of_none: anchors of the coarse model that belong to no cell, as from `anchors_of`.
-        cells: the anchors `around_seams` of each cell, read one after another.
-        most: upper bound of the number of all anchors.
+        cells: the anchors of each cell that are `in_core` and `near_seams`, read one after another.
+        most: upper bound of the number of anchors.
         cameras: the training views that show seams, in scene units.
     """
     settings, voxel = Settings(**shared[1]["settings"]), float(shared[1]["voxel"])
@@ -133,7 +130,7 @@ def begin_seams(
     around = {name: values[near] for name, values in of_none.items()}
     anchors = gathered_columns(itertools.chain([around], cells), most)
     trained = _on_seams(division, anchors, int(near.sum()))
-    return begin_part(shared, anchors, trained, ~trained, NOWHERE, (len(division.cells),))
+    return begin_part(shared, anchors, trained, NOWHERE, (len(division.cells),))
 
 
 def merged(
@@ -150,7 +147,7 @@ def merged(
 
     Args:
         shared, division, of_none, most: as for `begin_seams`.
-        cells: the anchors in the core of each cell, read one after another.
+        cells: the anchors of each cell that are `in_core`, read one after another.
         seams: checkpoint of the trained seams, without fixed anchors.
         progress: of the whole training.
         key: hash of the division, which the state keeps until the model is trained further.
