@@ -3,12 +3,12 @@
 
     python benchmarks/cells.py [--photos 576] [--cells 4] [--steps 6000] [--seeds 0 1] [--json] [--write]
 
-The capture is one of benchmarks/aerial.py. One training has as many anchors as it grows; the coarse model has at most a
-part of them, one for each cell, and each cell a little more, since cells overlap. Of the steps of the training in cells,
-some are those of the coarse model and of the seams. Differences to the held-out photos are compared in the pixels whose surface is near a cut between
-cells and in all others, for both models. Memory is measured on larger captures, too, in trainings of a few steps.
---write saves the figures to docs/figures/cells.json, the text to docs/cells.md and pictures of the differences to
-docs/cells.png.
+The capture is one of benchmarks/aerial.py. One training has as many anchors as it grows. The coarse model has at most
+that number divided by the number of cells, and each cell a little more, since cells overlap. Of the steps of the
+training in cells, some are those of the coarse model and of the seams. Differences to the held-out photos are compared
+in the pixels whose surface is near a cut between cells and in all others, for both models. Memory is measured on larger
+captures, too, in trainings of a few steps. --write saves the figures to docs/figures/cells.json, the text to
+docs/cells.md and pictures of the differences to docs/cells.png.
 """
 
 from __future__ import annotations
