@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..shared.errors import InputError
 from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file
 from ..shared.reconstruction.folder import STROKES
 from .files import encode_mask
@@ -25,6 +26,12 @@ def is_made(folder: Path) -> bool:
 def kept_masks(capture: Path) -> Path:
     """Return the folder in which the given masks of a capture are kept when others, made of them, replace them."""
     return capture / "masks-given"
+
+
+def require_place_for_given(capture: Path) -> None:
+    """Raise InputError if the given masks of a capture cannot be kept, since others are kept already."""
+    if kept_masks(capture).exists():
+        raise InputError(f"{kept_masks(capture)} exists, where the given masks would be kept; move it elsewhere.")
 
 
 @contextmanager

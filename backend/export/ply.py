@@ -172,13 +172,16 @@ class PositionRange:
         return "f8" if largest * FLOAT32_RELATIVE_ERROR > 1e-6 * extent else "f4"
 
 
-def rounding_warnings(path: Path, splats: Splats, step: float) -> list[str]:
-    """Return a warning if a file whose positions are multiples of `step` cannot hold those of splats."""
+def rounding_warnings(path: Path, splats: Splats, step: float, advice: str | None = None) -> list[str]:
+    """Return a warning if a file whose positions are multiples of `step` cannot hold those of splats.
+
+    advice: the end of the sentence; None: that for splats far from the origin.
+    """
     if len(splats) == 0 or step <= float(np.median(splats.scales.max(1))):
         return []
+    far = ", since some are far from the origin; hide floaters, export in Blender's coordinates, or as PLY."
     return [
-        f"{path.name} rounds positions to {step:.2g} units, which is more than the size of the splats, since some are "
-        "far from the origin; hide floaters, export in Blender's coordinates, or as PLY."
+        f"{path.name} rounds positions to {step:.2g} units, which is more than the size of the splats{advice or far}"
     ]
 
 

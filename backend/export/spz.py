@@ -52,8 +52,13 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
         Warnings about positions that were rounded, and about splats whose scales were clamped.
 
     Raises:
-        InputError: The splats are too far from the origin.
+        InputError: The splats are too far from the origin, or more than readers accept.
     """
+    if len(splats) > _MOST_SPLATS:
+        raise InputError(
+            f"{len(splats):,} splats are more than the {_MOST_SPLATS:,} that readers of SPZ accept; export fewer of "
+            "them, or as PLY."
+        )
     farthest = float(np.abs(splats.means).max(initial=0.0))
     bits = _FINEST_BITS
     while bits > 0 and farthest * 2**bits > _POSITION_LIMIT:
@@ -74,7 +79,8 @@ def write_spz(path: Path, splats: Splats) -> list[str]:
     ]
     # No time stamp, so that the same splats produce the same file.
     write_atomic(path, gzip.compress(header + b"".join(part.tobytes() for part in sections), 9, mtime=0))
-    warnings = rounding_warnings(path, splats, 2.0**-bits)
+    reason = "; scale them up, or export as PLY." if bits == _FINEST_BITS else None
+    warnings = rounding_warnings(path, splats, 2.0**-bits, reason)
     extreme = int(((logs.max(1) < _SMALLEST_LOG) | (logs.max(1) > _LARGEST_LOG)).sum())
     if extreme:
         warnings.append(

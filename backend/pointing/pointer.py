@@ -191,20 +191,23 @@ class Pointer:
             yield index, np.where((ranks[0] >= 0) & (parts[0] > 0.5), objects[np.maximum(ranks[0], 0)], 0)
 
     def masks(self, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each used view and its mask (H, W) int64, for the objects (N,) of the splats."""
-        objects, classes = np.unique(ids, return_inverse=True)
-        labeled = self.splats._replace(ids=torch.from_numpy(classes.astype(np.int32)).to(self.splats.means.device))
+        """Yield each used view and its mask (H, W) int64, 0 where no splats are, for the objects (N,) of the splats."""
+        objects, classes = np.unique(np.append(ids, 0), return_inverse=True)
+        of_splats = torch.from_numpy(classes[:-1].astype(np.int32)).to(self.splats.means.device)
+        labeled = self.splats._replace(ids=of_splats)
         for index in self._views.used:
             camera = self._views.camera(index)
             with torch.no_grad():
                 drawn = rasterize(*labeled[:6], camera, primitive=self._primitive)
-            shown = np.zeros((camera.height, camera.width, len(objects)), np.float32)
-            for found, part in zip(*(devices.host(plane) for plane in object_ranks(drawn, _RANKS)), strict=True):
+            ranks, parts = (devices.host(plane) for plane in object_ranks(drawn, _RANKS))
+            # Of all objects, a photo shows few.
+            present = np.union1d(ranks[ranks >= 0], 0)
+            shown = np.zeros((camera.height, camera.width, len(present)), np.float32)
+            for found, part in zip(ranks, parts, strict=True):
                 row, column = np.nonzero(found >= 0)
-                shown[row, column, found[row, column]] += part[row, column]
-            if objects[0] == 0:
-                shown[..., 0] += 1.0 - shown.sum(2)
-            yield index, objects[follow_edges(self._picture(index), shown)]
+                shown[row, column, np.searchsorted(present, found[row, column])] += part[row, column]
+            shown[..., 0] += 1.0 - shown.sum(2)
+            yield index, objects[present[follow_edges(self._picture(index), shown)]]
 
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...capture.colmap import Model
 from ...capture.files import image_size, mask_names, read_image, read_mask, same_shape
-from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, write_mask
+from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, require_place_for_given, write_mask
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...evaluation import contact_sheet
@@ -170,8 +170,7 @@ def _require_replaceable(capture: Path, given: Path) -> None:
     if given.resolve() == folder.resolve():
         if (folder / RECORD).is_file():
             raise InputError(f"{folder} was made of other masks, which {folder / RECORD} names; give those.")
-        if kept_masks(capture).exists():
-            raise InputError(f"{kept_masks(capture)} exists, where the given masks would be kept; move it elsewhere.")
+        require_place_for_given(capture)
     elif folder.exists() and not is_made(folder):
         raise InputError(f"{folder} exists; move it elsewhere, or give it as the masks.")
 

@@ -10,19 +10,27 @@ from typing import Any
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...capture.made_masks import REPAIRED, kept_masks, new_masks, write_mask
+from ...capture.made_masks import (
+    RECORD,
+    REPAIRED,
+    is_made,
+    kept_masks,
+    new_masks,
+    require_place_for_given,
+    write_mask,
+)
 from ...labels.renumbering import renumber_masks
 from ...model.generate import Generated
 from ...model.splats import Splats
 from ...pointing.mask_repair import Repair, repair_masks
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
-from ...shared.reconstruction.folder import STROKES
+from ...shared.reconstruction.folder import STROKES, Reconstruction
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
-from ..folder import READ, Trained, memory_for_files
+from ..folder import READ, Trained, memory_for_files, require_reconstruction
 from ..imported import write_labeled
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -48,6 +56,13 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
             EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
+    with locked(folder.folder):
+        _clean_labels(options, reporter)
+
+
+def _clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     opened = open_pointable(options, reporter)
     source = require_splats(opened)
     trained = None if isinstance(source, Splats) else source
@@ -61,32 +76,34 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
     }
     if not any(mask.any() for mask in given.values()):
         raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
+    if not is_made(capture.folder / "masks"):
+        require_place_for_given(capture.folder)
     reporter.expect({
         KERNELS: ("Preparing", kernel_seconds(opened.device)),
         _TRAIN: ("Training", 0.0 if trained is None else border_seconds(trained)),
     })  # fmt: skip
     ensure_kernels(reporter, opened.device)
-    with locked(opened.folder.folder):
-        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-        with stage(opened.folder, "label cleanup"):
-            pointer = opened.pointer(reporter.progress)
-            reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
-            scene = None if trained is None else trained.scene
-            zero_is_known = scene is not None and (scene.supervise_background or scene.zero_is_object)
-            anew = renumber_masks(capture, given, _CONSISTENT)
-            if anew.agreement < _CONSISTENT:
-                reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
-            repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
-            reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
-            changed, moved = _changed(capture, given, repair), _moved(source, opened.splats, capture, repair)
-            _write(capture, repair.masks, {"changed": changed, "moved": moved}, reporter)
-        if isinstance(source, Splats):
-            reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
-            write_labeled(opened.folder, source, repair.ids, capture.names, reporter)
-        else:
-            offsets = opened.splats.source.cpu().numpy()
-            trainer = begin_border_training(source, offsets, repair.ids, options, reporter)
-            train_borders(source, trainer, reporter)
+    reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+    with stage(opened.folder, "label cleanup"):
+        pointer = opened.pointer(reporter.progress)
+        reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
+        scene = None if trained is None else trained.scene
+        zero_is_known = scene is not None and (scene.supervise_background or scene.zero_is_object)
+        anew = renumber_masks(capture, given, _CONSISTENT)
+        if anew.agreement < _CONSISTENT:
+            reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
+        repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
+        reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
+        changed, moved = _changed(capture, given, repair), _moved(source, opened.splats, capture, repair)
+        is_same = anew.agreement >= _CONSISTENT
+        _write(capture, repair.masks, {"changed": changed, "moved": moved}, is_same, reporter)
+    if isinstance(source, Splats):
+        reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
+        write_labeled(opened.folder, source, repair.ids, capture.names, reporter)
+    else:
+        offsets = opened.splats.source.cpu().numpy()
+        trainer = begin_border_training(source, offsets, repair.ids, options, reporter)
+        train_borders(source, trainer, reporter)
     _tell(changed, moved, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"),
@@ -133,8 +150,17 @@ def _moved(
     return sorted(found, key=lambda entry: -float(entry["moved"]))
 
 
-def _write(capture: Capture, masks: dict[int, np.ndarray], record: dict[str, Any], reporter: StoppingReporter) -> None:
-    """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged."""
+def _write(
+    capture: Capture,
+    masks: dict[int, np.ndarray],
+    record: dict[str, Any],
+    keeps_ids: bool,
+    reporter: StoppingReporter,
+) -> None:
+    """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged.
+
+    keeps_ids: whether IDs mean the objects that they meant in the given masks.
+    """
     before, kept = capture.folder / "masks", kept_masks(capture.folder)
     # Masks that were repaired already are not given ones.
     is_given = before.is_dir() and not (before / REPAIRED).is_file() and not kept.exists()
@@ -142,17 +168,21 @@ def _write(capture: Capture, masks: dict[int, np.ndarray], record: dict[str, Any
         whole = capture.edited({}, ())
         for index, view in enumerate(capture.views):
             mask, file = masks.get(index), whole.uncorrected_mask(index)
-            if mask is None:
-                mask = file
-            elif file is not None:
+            if mask is not None and file is not None:
                 # Objects that are left out of the training are still in the file.
                 mask = np.where((mask == 0) & np.isin(file, capture.left_out), file, mask)
-            if mask is not None:
+            path = whole.views[index].mask_file
+            if path is not None and (mask is None or file is None or np.array_equal(mask, file)):
+                # As it is, since the view may be smaller than the photo, or show less of it.
+                same = folder / path.relative_to(before)
+                same.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, same)
+            elif mask is not None:
                 write_mask(folder, view.name, capture.photo_mask(index, mask))
             reporter.progress(index + 1, len(capture), what="photos")
-        strokes = before / STROKES
-        if strokes.is_file():
-            shutil.copyfile(strokes, folder / STROKES)
+        for name in (STROKES, *([RECORD] if keeps_ids else [])):
+            if (before / name).is_file():
+                shutil.copyfile(before / name, folder / name)
         write_json(folder / REPAIRED, record)
 
 

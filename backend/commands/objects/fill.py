@@ -22,13 +22,15 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     if not folder.splats.is_file():
         return {}  # Edits may exist before splats.
     objects = read_objects(folder.objects)
-    path = fill_path(folder, objects)
-    if path is None:
-        return {}
-    if not path.is_file():
+    while (path := fill_path(folder, objects)) is not None and not path.is_file():
         reporter.begin(FILL, "Filling the holes of removed objects")
         path.parent.mkdir(parents=True, exist_ok=True)
-        fill = compute_fill(apply_splat_edits(read_splats(folder.splats)[0], folder)[0], objects, reporter)
+        splats = apply_splat_edits(read_splats(folder.splats)[0], folder)[0]
+        if fill_path(folder, objects) != path:
+            continue  # Splats were deleted in the meantime.
+        fill = compute_fill(splats, objects, reporter)
         write_fill(path, FillRows(splat_table(fill.splats), fill.put, fill.fills))
+    if path is None:
+        return {}
     rows = read_fill(path)
     return {entry.id: rows.count_new(entry.id) for entry in objects if entry.removed and entry.fill}

@@ -46,8 +46,7 @@ def film(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         }
     )  # fmt: skip
     reporter.begin(READ, "Reading the splats")
-    primitive = training.settings.get("primitive", "3d") if (training := read_record(folder).training) else "3d"
-    stage = Stage(folder, primitive, device, reporter)
+    stage = Stage(folder, _primitive(folder), device, reporter)
     wanted = [(frame, stage.digest(shot, frame)) for frame in frames]
     missing = [(frame, digest) for frame, digest in wanted if not _is_done(options, frame, digest)]
     _create_folder(options.out)
@@ -87,6 +86,14 @@ def _create_folder(folder: Path) -> None:
 def _is_done(options: argparse.Namespace, frame: Frame, digest: str) -> bool:
     path = frame_path(options.out, frame.number)
     return exr.digest_of(path) == digest and (not options.png or path.with_suffix(".png").is_file())
+
+
+def _primitive(folder: Reconstruction) -> str:
+    """Return what the splats in splats.ply are; those that were fitted to a view-dependent model are no discs."""
+    training = read_record(folder).training
+    if training is None or training.settings.get("mode", "explicit") != "explicit":
+        return "3d"
+    return training.settings.get("primitive", "3d")
 
 
 def _progress_text(missing: int, total: int) -> str:

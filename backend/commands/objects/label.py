@@ -19,7 +19,7 @@ from ...shared.events import Reporter
 from ...shared.formats.json_file import write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
-from ...shared.reconstruction.folder import STROKES
+from ...shared.reconstruction.folder import STROKES, Reconstruction
 from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.objects import default_name, forget_vanished
 from ...shared.reconstruction.plan import write_plan
@@ -29,7 +29,15 @@ from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
-from ..folder import READ, Trained, memory_for_files, memory_for_targets, outdate_results, plan_of
+from ..folder import (
+    READ,
+    Trained,
+    memory_for_files,
+    memory_for_targets,
+    outdate_results,
+    plan_of,
+    require_reconstruction,
+)
 from ..imported import write_labeled
 from ..planning import build_context, find_requested_objects
 from ..setup.kernels import PART as KERNELS
@@ -51,12 +59,15 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    opened = open_pointable(options, reporter)
-    source = require_splats(opened)
-    if isinstance(source, Splats):
-        _label_plain(opened, source, options, reporter)
-    else:
-        _label_trained(opened, source, options, reporter)
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
+    with locked(folder.folder):
+        opened = open_pointable(options, reporter)
+        source = require_splats(opened)
+        if isinstance(source, Splats):
+            _label_plain(opened, source, options, reporter)
+        else:
+            _label_trained(opened, source, options, reporter)
 
 
 def _label_trained(
@@ -69,16 +80,15 @@ def _label_trained(
     segment = segmentation(options, device)
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
-    with locked(trained.folder.folder):
-        forget_vanished(trained.folder.objects)
-        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-        with stage(trained.folder, "label"):
-            pointer = opened.pointer(reporter.progress, segment)
-            ids = pointer.solve(strokes)
-            reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
-            _write_masks(capture, pointer, ids, strokes, options, reporter)
-        trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
-        train_borders(trained, trainer, reporter)
+    forget_vanished(trained.folder.objects)
+    reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+    with stage(trained.folder, "label"):
+        pointer = opened.pointer(reporter.progress, segment)
+        ids = pointer.solve(strokes)
+        reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
+        _write_masks(capture, pointer, ids, strokes, options, reporter)
+    trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
+    train_borders(trained, trainer, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"), objects=_number_of(strokes), views=len(capture.train_indices),
         splats=str(trained.folder.splats), steps=trainer.progress.step,
@@ -91,13 +101,12 @@ def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace,
     strokes = read_strokes(options.strokes, opened.views.names)
     segment = segmentation(options, opened.device)
     ensure_kernels(reporter, opened.device)
-    with locked(opened.folder.folder):
-        forget_vanished(opened.folder.objects)
-        reporter.begin(GRAPH, "Comparing the splats with their neighbors")
-        with stage(opened.folder, "label"):
-            ids = opened.pointer(reporter.progress, segment).solve(strokes)
-        reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
-        write_labeled(opened.folder, splats, ids, strokes.names, reporter)
+    forget_vanished(opened.folder.objects)
+    reporter.begin(GRAPH, "Comparing the splats with their neighbors")
+    with stage(opened.folder, "label"):
+        ids = opened.pointer(reporter.progress, segment).solve(strokes)
+    reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
+    write_labeled(opened.folder, splats, ids, strokes.names, reporter)
     reporter.done(objects=_number_of(strokes), splats=str(opened.folder.splats))
 
 

@@ -31,7 +31,7 @@ from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, open_trained
+from ..folder import READ, Trained, open_trained, require_reconstruction
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -65,10 +65,11 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             DISCS: ("Fitting discs", 30.0), "meshes": ("Meshing", 30.0),
         }
     )  # fmt: skip
-    trained = open_trained(options, reporter)
-    folder = trained.folder
-    ensure_kernels(reporter, trained.model.device)
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
     with locked(folder.folder):
+        trained = open_trained(options, reporter)
+        ensure_kernels(reporter, trained.model.device)
         targets = _targets(options, folder)
         folder.meshes.mkdir(exist_ok=True)
         known = {} if options.restart else _known_meshes(folder)
@@ -193,6 +194,8 @@ def _targets(options: argparse.Namespace, folder: Reconstruction) -> list[Target
         ids = {i for word in words for i in (groups[find(word)].ids or ())}
         if name == SCENE or name.isdecimal():
             raise InputError(f"--set {name}=... would replace another mesh; choose another name.")
+        if any(target.key == name for target in targets):
+            raise InputError(f"--set {name}=... is given twice; choose two names.")
         targets.append(Target(name, name, tuple(sorted(ids))))
     if options.scene:
         targets.append(Target(SCENE, "the whole scene", None))

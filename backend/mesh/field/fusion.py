@@ -35,6 +35,8 @@ _BYTES_PER_BLOCK = 8 * SAMPLES * 4
 """Largest memory of a block: sums, values, flags and the triangles in it."""
 _KEPT_BYTES = 1.5e9
 """Memory of views' observations that are kept; the others are made again each time, as with many large photos."""
+_MOST_POINTS, _THINNING = 8_000_000, 3
+"""Number of observed points that are kept in memory, 32 bytes each, and by what they are divided where it is passed."""
 _COARSEST, _FEW = 16, 1000
 """Smallest number of voxels along the longest side, regardless of memory; additional blocks allowed in this case."""
 _FILLING = 8
@@ -77,7 +79,7 @@ class _Extent:
     """The extent of an object.
 
     Attributes:
-        points: Observed points (n, 3).
+        points: Observed points (n, 3), of many a part.
         low, high: Corners of the bounding box without outliers.
         pixel: Median size of a pixel on the object.
         nearest: Smallest depth of the object in a view.
@@ -138,8 +140,8 @@ def fuse(
 
 
 def _extent(views: SeesObjects, classes: Sequence[int], reporter: Reporter) -> _Extent:
-    """Compute the extent of the object from all pixels that show it."""
-    points, pixels, nearest = [np.zeros((0, 3))], [np.zeros(0)], np.inf
+    """Compute the extent of the object from the pixels that show it."""
+    points, pixels, nearest, every = [np.zeros((0, 3))], [np.zeros(0)], np.inf, 1
     for done, index in enumerate(views.indices):
         reporter.progress(done, 2 * len(views.indices) + _FILLING)
         view = views.object_view(index, classes)
@@ -148,14 +150,23 @@ def _extent(views: SeesObjects, classes: Sequence[int], reporter: Reporter) -> _
         depth = visible_depth(view)
         v, u = np.nonzero(depth)
         d = depth[v, u].astype(np.float64)
+        nearest = min(nearest, d.min(initial=np.inf))
+        kept = slice(done % every, None, every)
+        v, u, d = v[kept], u[kept], d[kept]
         points.append(_lifted(view.camera, u + 0.5, v + 0.5, d))
         pixels.append(d / view.camera.K[0, 0])
-        nearest = min(nearest, d.min(initial=np.inf))
-    every = np.concatenate(points)
-    if len(every) < 8:
+        while sum(map(len, pixels)) > _MOST_POINTS:
+            every *= _THINNING
+            points, pixels = (
+                # Others in each view, in case all pixels of a column are left out.
+                [values[i % _THINNING :: _THINNING].copy() for i, values in enumerate(each)]
+                for each in (points, pixels)
+            )
+    found = np.concatenate(points)
+    if len(found) < 8:
         raise NoSurface("No view shows enough of it: it is hidden, out of view or too small to be seen.")
-    low, high = np.quantile(every, (0.01, 0.99), axis=0)
-    return _Extent(every, low, high, float(np.median(np.concatenate(pixels))), float(nearest))
+    low, high = np.quantile(found, (0.01, 0.99), axis=0)
+    return _Extent(found, low, high, float(np.median(np.concatenate(pixels))), float(nearest))
 
 
 def _lifted(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
