@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL import ExifTags
+from PIL import ExifTags, ImageCms
 from PIL import Image as PilImage
 
 from ..shared.class_table import LARGEST_ID
@@ -105,10 +105,11 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> PilImage.Image:
-    """Read an image as 8-bit RGB without alpha; as in COLMAP, orientation tags are ignored. Raises InputError."""
-    with _opened(path) as image:
+    """Read an image as 8-bit sRGB without alpha; as in COLMAP, orientation tags are ignored. Raises InputError."""
+    with _opened(path) as opened:
         try:
-            image.load()
+            opened.load()
+            image: PilImage.Image = in_srgb(opened)
             if image.mode in ("I", "I;16", "I;16B", "I;16L"):
                 values = np.asarray(image).astype(np.int64)
                 image = PilImage.fromarray((np.clip(values, 0, 65535) // 257).astype(np.uint8))
@@ -116,12 +117,33 @@ def read_image(path: Path) -> PilImage.Image:
                 raise InputError(f"{path} contains floating-point pixels; save it as an 8- or 16-bit image.")
             if image.mode == "P" and "transparency" in image.info:
                 return image.convert("RGBA").convert("RGB")
-            if image.mode in ("RGBA", "RGBX"):
-                # Not convert(): some versions turn fully transparent pixels black.
-                return PilImage.merge("RGB", image.split()[:3])
-            return image.convert("RGB")
+            return _without_alpha(image).convert("RGB")
         except _OPENING_ERRORS as error:
             raise _unreadable(path, error) from error
+
+
+def _without_alpha(image: PilImage.Image) -> PilImage.Image:
+    # Not convert(): some versions turn fully transparent pixels black.
+    return PilImage.merge("RGB", image.split()[:3]) if image.mode in ("RGBA", "RGBX") else image
+
+
+def in_srgb(image: PilImage.Image) -> PilImage.Image:
+    """Return an image in the colors of sRGB, if it has a profile of others, as photos of phones (Display P3)."""
+    profile = image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA", "RGBX", "L", "CMYK"):
+        return image
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if ImageCms.getProfileDescription(source).startswith("sRGB"):
+            return image
+        srgb = ImageCms.createProfile("sRGB")
+        shown = ImageCms.profileToProfile(_without_alpha(image), source, srgb, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError):
+        return image
+    assert shown is not None
+    # Its EXIF data refer to places in themselves, so they are not copied entry by entry.
+    shown.info["exif"] = image.info.get("exif", b"")
+    return shown
 
 
 def _opened(path: Path) -> PilImage.Image:

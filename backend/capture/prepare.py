@@ -21,7 +21,7 @@ from .files import encode_mask, image_size, read_image, write_image
 from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse, run_in_parallel, survey_capture
 from .undistort import resample_image, resample_mask
 
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 _BACKGROUND = (128, 128, 128)
 """Color behind objects that turned before a background at rest."""
 

@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..capture import Capture, View
+from ..shared.stopping import Check
 from .patch_match import RADIUS, Others, match, match_planes, packed
 from .scene_planes import ScenePlane, find_planes
 
@@ -112,7 +113,7 @@ def find_depth_maps(
     Args:
         capture: the capture; must be prepared.
         views: indices of the views to use.
-        progress: called with the number of photos done, and of all.
+        progress: called with the number of photos done, and of all; at intervals also when all are done.
 
     Returns:
         The depth maps of the views that others overlap. Depths that fewer than FEWEST others find are left out, as are
@@ -137,9 +138,10 @@ def find_depth_maps(
         agreed[index] = _without_speckles(_restricted(found, _agreeing(capture, others, xyz) >= FEWEST))
     result = {}
     for index, found in agreed.items():
+        progress(len(views), len(views))
         xyz, _ = found.points(capture.views[index])
         result[index] = _restricted(found, balance(capture, agreed, xyz, without=index) > 0)
-    return _with_planes(capture, scaled, result)
+    return _with_planes(capture, scaled, result, lambda: progress(len(views), len(views)))
 
 
 def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None) -> np.ndarray:
@@ -162,9 +164,9 @@ def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, withou
 
 
 def _with_planes(
-    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap]
+    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap], check: Check
 ) -> dict[int, DepthMap]:
-    """Return depth maps with more depths, on the large planes of the scene."""
+    """Return depth maps with more depths, on the large planes of the scene; check: called for each."""
     if not maps:
         return maps
     views = capture.views
@@ -176,12 +178,13 @@ def _with_planes(
     if not planes:
         return maps
     neighbors = _neighbors(capture, list(maps), NEIGHBORS_ON_PLANES)
-    filled = {
-        index: _without_speckles(_on_planes(capture, scaled, index, found, planes, neighbors[index]))
-        for index, found in maps.items()
-    }
+    filled = {}
+    for index, found in maps.items():
+        check()
+        filled[index] = _without_speckles(_on_planes(capture, scaled, index, found, planes, neighbors[index]))
     result = {}
     for index, found in filled.items():
+        check()
         before = maps[index]
         added = found._replace(depths=np.where(before.depths > 0, 0.0, found.depths))
         xyz, _ = added.points(views[index])

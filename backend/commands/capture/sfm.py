@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import shutil
 import time
+import unicodedata
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,16 @@ from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import make_folder, recorded
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, REPORT, VIDEOS, WORK, PhotosSource, read_source, write_source
+from ...shared.formats.photos_source import (
+    PHOTOS,
+    REPORT,
+    SOURCE,
+    VIDEOS,
+    WORK,
+    PhotosSource,
+    read_source,
+    write_source,
+)
 from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter
@@ -98,7 +109,7 @@ def _require_sources(sources: list[Path]) -> None:
 
 def _require_own(source: Path, capture: Path) -> None:
     """Raise InputError if the capture's folder has files of others, or a model that this command has not made."""
-    if not capture.exists() or (capture / WORK).is_dir():
+    if not capture.exists() or (capture / WORK / SOURCE).exists():
         return
     if not capture.is_dir():
         raise InputError(f"{capture} is a file; choose another --out.")
@@ -107,8 +118,13 @@ def _require_own(source: Path, capture: Path) -> None:
         raise InputError(f"{capture} has a COLMAP model already, {capture / 'sparse'}; choose another --out.")
     if is_source and (capture / IMAGES).is_dir():
         return
-    if any(path.name not in IGNORED for path in capture.iterdir()):
+    if any(path.name not in (*IGNORED, WORK) for path in capture.iterdir()) or _has_files(capture / WORK):
         raise InputError(f"{capture} contains other files; choose a new folder as --out.")
+
+
+def _has_files(work: Path) -> bool:
+    """Return whether a folder sfm/, which is not one of a capture, has files of another program."""
+    return work.exists() and (not work.is_dir() or any(path.name not in IGNORED for path in work.iterdir()))
 
 
 def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> None:
@@ -128,7 +144,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         source = images
     else:
         source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
-    unwanted = {name: "it was left out by request" for name in made_from.leave_out}
+    unwanted = _unwanted(made_from.leave_out, photos, reporter)
     photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]
     count = len(photos)
@@ -158,6 +174,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         write_source(capture, replace(made_from, features="objects"))
 
     candidates: list[model.Candidate] = []
+    has_failed = False
     for mapper in ("global", "incremental"):
         best = model.best_of(candidates)
         if best is not None and len(best.agreement.trusted) >= _ENOUGH * count:
@@ -167,7 +184,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         shutil.rmtree(out, ignore_errors=True)
         make_folder(out)
         arguments = [mapper, str(path), str(images), str(out), str(listed_names), *calibrated]
-        run_stage(reporter, log, arguments, lambda lines: lines, count)
+        has_failed |= not run_stage(reporter, log, arguments, lambda lines: lines, count)
         candidate = model.read_candidate(mapper, out, path, made_from.set)
         if candidate is not None:
             candidates.append(candidate)
@@ -178,6 +195,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         raise InputError(
             f"The photos in {source} do not fit together: no two of them show the same scene from different places "
             "with enough detail; take more photos, each overlapping the one before by two thirds."
+            + (f" If they do fit, {log} tells why COLMAP has failed." if has_failed else "")
         )
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
@@ -215,6 +233,26 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     _tell(report, capture, reporter)
 
 
+def _unwanted(leave_out: Iterable[str], photos: list[Photo], reporter: Reporter) -> dict[str, str]:
+    """Return the photos that are left out, with the reason; warns of names that no photo has."""
+    names: dict[str, str] = {}
+    for photo in photos:
+        names.setdefault(unicodedata.normalize("NFC", Path(photo.name).with_suffix("").as_posix()), photo.name)
+    names |= {unicodedata.normalize("NFC", photo.name): photo.name for photo in photos}
+    found, missing = {}, []
+    for given in leave_out:
+        composed = unicodedata.normalize("NFC", given)
+        # Photos that were converted have another suffix.
+        name = names.get(composed) or names.get(Path(composed).with_suffix("").as_posix())
+        if name is None:
+            missing.append(given)
+        else:
+            found[name] = "it was left out by request"
+    if missing:
+        reporter.warning(f"No photo is named {', '.join(missing)}, so nothing was left out for that.")
+    return found
+
+
 def _place(found: pycolmap.Reconstruction, capture: Path, by_gps: float | None) -> None:
     """Scale a model, and place it where that of an earlier run was, since a scene may have been set up there."""
     former = former_poses(capture) if _had_size_by_gps(capture) == (by_gps is not None) else {}
@@ -242,6 +280,7 @@ def _refined(
     found.write(before)
     if run_stage(reporter, log, ["refine", str(before), str(after), *calibrated], lambda lines: lines, 1):
         return pycolmap.Reconstruction(after)
+    reporter.warning(f"The lenses and poses could not be refined and are less exact; {log} tells why.")
     return found
 
 
@@ -268,7 +307,7 @@ def _densify(
         model.remove_points(found, photos.points.ids[points.in_front])
         model.add_points(found, points.xyz, points.rgb)
         model.write_model(found, capture)
-        contrasts = measure_contrasts(photos, range(len(photos.views)))
+        contrasts = measure_contrasts(photos, range(len(photos.views)), reporter.check)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return {
@@ -286,7 +325,7 @@ class _StopsOnly(Reporter):
 
     def progress(self, *_: Any, **_fields: Any) -> None:
         if self._reporter.stop():
-            raise Cancelled("Stopped; features, matches and poses are kept. Run the same command again to continue.")
+            raise Cancelled("Stopped; features and matches are kept. Run the same command again to continue.")
 
 
 def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[dict[str, Any]]:

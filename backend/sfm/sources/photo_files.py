@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import pillow_heif
-from PIL import ExifTags, ImageCms, ImageOps
+from PIL import ExifTags, ImageOps
 from PIL import Image as PilImage
 
-from ...capture.files import read_image, write_image
+from ...capture.files import image_size, in_srgb, read_image, write_image
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.photos_source import RAW
@@ -41,8 +41,6 @@ def camera_of(path: Path, turned: bool) -> str:
     Raises:
         InputError: it cannot be read.
     """
-    if path.suffix.lower() in RAW:
-        return path.suffix.lower()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -54,9 +52,33 @@ def camera_of(path: Path, turned: bool) -> str:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged or its format is unknown.") from error
     if turned and _orientation(exif) > 4:
         size = size[::-1]
+    return f"{size[0]}x{size[1]} {_lens_of(exif)}"
+
+
+def camera_of_raw(path: Path, developed: Path) -> str:
+    """Return the same of a raw photo, for the size of its developed copy, as far as Pillow reads its EXIF data.
+
+    Raises:
+        InputError: the copy cannot be read.
+    """
+    width, height = image_size(developed)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with PilImage.open(path) as image:
+                lens = _lens_of(image.getexif())
+    except Exception:
+        lens = ""
+    return f"{width}x{height} {path.suffix.lower()} {lens}"
+
+
+def _lens_of(exif: PilImage.Exif) -> str:
+    """Return model, focal length and digital zoom by EXIF."""
     details = exif.get_ifd(ExifTags.IFD.Exif)
     maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
-    return " ".join([f"{size[0]}x{size[1]}", *maker, str(details.get(ExifTags.Base.FocalLength, ""))])
+    # A digital zoom keeps the size and the focal length of the lens.
+    zoom = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
+    return " ".join([*maker, *(str(details.get(tag, "")) for tag in zoom)])
 
 
 def gps_position(path: Path) -> tuple[float, float, float] | None:
@@ -107,7 +129,7 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
     if suffix in RAW:
         write_image(target, _developed(path))
     elif is_heic:
-        write_atomic(target, _as_jpeg(path, _with_colors))
+        write_atomic(target, _as_jpeg(path, lambda image: image))
     elif not is_kept:
         write_image(target, read_image(path))
     elif turn and suffix in (".jpg", ".jpeg") and _is_turned(path):
@@ -135,11 +157,11 @@ def _format_of(path: Path) -> str | None:
 
 
 def _as_jpeg(path: Path, change: Callable[[PilImage.Image], PilImage.Image]) -> bytes:
-    """Return a changed photo as JPEG with its EXIF data; raises InputError if it is damaged."""
+    """Return a changed photo as JPEG in sRGB with its EXIF data; raises InputError if it is damaged."""
     buffer = io.BytesIO()
     try:
         with PilImage.open(path) as image:
-            changed = change(image)
+            changed = in_srgb(change(image))
             changed.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=changed.getexif())
     except Exception as error:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged.") from error
@@ -154,22 +176,6 @@ def _orientation(exif: PilImage.Exif) -> int:
 def _is_turned(path: Path) -> bool:
     with PilImage.open(path) as image:
         return _orientation(image.getexif()) > 1
-
-
-def _with_colors(image: PilImage.Image) -> PilImage.Image:
-    """Return an image in sRGB, which phones store with the colors of their displays (Display P3)."""
-    profile = image.info.get("icc_profile")
-    if not profile:
-        return image
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        shown = ImageCms.profileToProfile(image.convert("RGB"), source, ImageCms.createProfile("sRGB"))
-    except (ImageCms.PyCMSError, OSError):
-        return image
-    assert shown is not None
-    # Its EXIF data refer to places in themselves, so they are not copied entry by entry.
-    shown.info["exif"] = image.info.get("exif", b"")
-    return shown
 
 
 def _developed(path: Path) -> PilImage.Image:

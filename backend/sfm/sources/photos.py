@@ -129,7 +129,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         relative = path.relative_to(base)
         name = relative.as_posix()
         try:
-            camera = photo_files.camera_of(path, turn)
+            is_raw = path.suffix.lower() in photo_files.RAW
+            camera = "" if is_raw else photo_files.camera_of(path, turn)
             if in_place and not photo_files.is_read_by_colmap(path):
                 raise InputError(f"{path.name} would have to be converted; choose another folder as --out.")
             copy = _readable(relative)
@@ -141,6 +142,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             if not in_place:
                 copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
+                if is_raw:
+                    camera = photo_files.camera_of_raw(path, copied)
             photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
             names[name] = relative.as_posix()
         except InputError as error:
@@ -231,6 +234,10 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
     asked = {"file": str(path.resolve()), "bytes": status.st_size, "modified": status.st_mtime_ns, "frames": count}
     entry = known.get(folder, {})
     names = entry.get("names") if all(entry.get(key) == value for key, value in asked.items()) else None
+    if entry and any(entry.get(key) != asked[key] for key in ("bytes", "modified")):
+        # Frames of another video have the same names, whose features would be kept.
+        database.remove_all(capture / WORK)
+        write_json(listed, {name: other for name, other in known.items() if name != folder})
     before = [capture / IMAGES / folder / name for name in entry.get("names", [])]
     if names is None or not all((capture / IMAGES / folder / name).is_file() for name in names):
         reporter.status(f"Choosing frames of {path.name}")
@@ -245,7 +252,8 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
 def _listed(base: Path, capture: Path) -> list[Path]:
     """Return the photos and videos below a folder in natural order, without those of the capture, if it is in there.
 
-    Of a raw or HEIC photo beside its JPEG, the latter is taken, and of a Live Photo the photo alone.
+    Of a raw or HEIC photo beside its JPEG, the latter is taken, of a raw photo beside its HEIC, that, and of a Live
+    Photo the photo alone.
     """
     try:
         inside = capture.resolve()
@@ -260,11 +268,13 @@ def _listed(base: Path, capture: Path) -> list[Path]:
     except OSError as error:
         raise InputError(f"{error.filename or base} cannot be read ({error.strerror}); check it.") from error
     copied = {path.with_suffix("") for path in paths if path.suffix.lower() in photo_files.COPIED}
+    developed = {path.with_suffix("") for path in paths if path.suffix.lower() in PHOTOS - photo_files.RAW}
     photos = {path.with_suffix("") for path in paths if path.suffix.lower() in PHOTOS}
 
     def is_double(path: Path) -> bool:
         suffix = path.suffix.lower()
-        return suffix not in photo_files.COPIED and path.with_suffix("") in (photos if suffix in VIDEOS else copied)
+        others = photos if suffix in VIDEOS else developed if suffix in photo_files.RAW else copied
+        return suffix not in photo_files.COPIED and path.with_suffix("") in others
 
     return sorted((path for path in paths if not is_double(path)), key=lambda path: natural_order(path.as_posix()))
 

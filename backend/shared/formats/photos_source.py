@@ -18,7 +18,7 @@ WORK = "sfm"
 """Folder in the capture for what the computation of poses keeps."""
 REPORT = "sfm.json"
 """File there about the poses that were found."""
-_SOURCE = "source.json"
+SOURCE = "source.json"
 
 # Suffixes in lower case
 
@@ -65,7 +65,7 @@ class PhotosSource:
 def write_source(capture: Path, source: PhotosSource) -> None:
     """Write sfm/source.json of a capture."""
     write_json(
-        capture / WORK / _SOURCE,
+        capture / WORK / SOURCE,
         {
             "photos": [str(path.resolve()) for path in source.photos],
             "cameras": source.cameras,
@@ -82,7 +82,7 @@ def write_source(capture: Path, source: PhotosSource) -> None:
 def read_source(capture: Path) -> PhotosSource | None:
     """Read sfm/source.json of a capture; return None if it is missing or invalid."""
     try:
-        stored = read_json(capture / WORK / _SOURCE)
+        stored = read_json(capture / WORK / SOURCE)
         frames, calibration, matcher = stored.get("frames"), stored.get("calibration"), stored.get("matcher")
         return PhotosSource(
             [Path(path) for path in stored["photos"]],
