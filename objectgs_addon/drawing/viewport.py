@@ -131,9 +131,16 @@ def _show_previews() -> None:
 
 def show(properties: Any, _context: bpy.types.Context = None) -> None:
     """Switch a scene's splats between the geometry nodes preview and this drawing."""
+    undrawn = _undrawn()
     for part in gather.carriers(properties.id_data):
-        show_preview(part, not _is_drawn(properties))
+        show_preview(part, part in undrawn)
     redraw()
+
+
+def _undrawn() -> set[bpy.types.Object]:
+    """Return the splats in scenes that do not draw them; scenes that share splats share their preview."""
+    scenes = [scene for scene in bpy.data.scenes if not _is_drawn(scene.objectgs)]
+    return {part for scene in scenes for part in gather.carriers(scene)}
 
 
 def redraw(_properties: Any = None, _context: bpy.types.Context = None) -> None:
@@ -156,8 +163,9 @@ def _redraw_when_built() -> float | None:
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
     """Switch off the preview of new splats."""
     if _is_drawn(scene.objectgs) and is_in_file():
+        undrawn = _undrawn()
         for part in gather.carriers(scene):
-            show_preview(part, False)
+            show_preview(part, part in undrawn)
 
 
 def register() -> None:

@@ -7,9 +7,15 @@ from collections.abc import Sequence
 
 import bpy
 import numpy as np
+from mathutils import Matrix
+
+from ..scene import matrix_to_world
 
 MOST_KEYS = 12
 """Number of cameras that the path passes through; more would repeat the shaking of a hand."""
+
+_LENS = ("sensor_fit", "sensor_width", "sensor_height", "lens", "shift_x", "shift_y", "clip_start", "clip_end")
+"""Settings of a camera that another one gets."""
 
 _JUMP = 3.0
 """Mean step from one camera to the next, relative to the distance of nearest cameras, from which on they count as
@@ -47,12 +53,14 @@ def make_path(scene: bpy.types.Scene, cameras: Sequence[bpy.types.Object], first
     Returns:
         The camera, which has the lens of the first of them.
     """
-    order = path_order(np.array([camera.matrix_world.translation for camera in cameras]))
+    # Blender does not update the matrices of cameras in a collection that is excluded from the view layer.
+    poses = [Matrix(matrix_to_world(camera).tolist()) for camera in cameras]
+    order = path_order(np.array([pose.translation for pose in poses]))
     chosen = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), MOST_KEYS)).round().astype(int))]
     moving = new_camera(scene, "Camera Path", cameras[chosen[0]].data)
     before = None
     for frame, index in zip(np.linspace(first, last, len(chosen)), chosen.tolist()):
-        location, rotation, _scale = cameras[index].matrix_world.decompose()
+        location, rotation, _scale = poses[index].decompose()
         if before is not None and before.dot(rotation) < 0:
             rotation.negate()  # The shorter of two rotations.
         before = rotation
@@ -66,7 +74,7 @@ def new_camera(scene: bpy.types.Scene, name: str, like: bpy.types.Camera | None)
     """Create a camera in a scene, make it the scene's, and give it the lens of the camera `like`, if there is one."""
     data = bpy.data.cameras.new(name)
     if like is not None:
-        for setting in ("sensor_fit", "sensor_width", "sensor_height", "lens", "shift_x", "shift_y"):
+        for setting in _LENS:
             setattr(data, setting, getattr(like, setting))
     camera = bpy.data.objects.new(name, data)
     camera.rotation_mode = "QUATERNION"

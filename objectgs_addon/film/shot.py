@@ -247,8 +247,8 @@ def _is_below(obj: bpy.types.Object, parent: bpy.types.Object) -> bool:
 
 
 def _world_of(obj: bpy.types.Object) -> Matrix:
-    """Return an object's world matrix, computed from its parent's if hidden, since Blender skips hidden objects."""
-    if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT":
+    """Return an object's world matrix, computed from its parent's if hidden, since Blender may skip hidden objects."""
+    if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT" or obj.constraints:
         return obj.matrix_world
     return _world_of(obj.parent) @ obj.matrix_parent_inverse @ obj.matrix_basis
 

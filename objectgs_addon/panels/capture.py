@@ -62,7 +62,7 @@ class CapturePanel(Tab, bpy.types.Panel):
             row.menu("OBJECTGS_MT_add", text="", icon="ADD")
             _draw_folder(layout, active)
         if step := _step(active, context.scene):
-            _draw_next_step(layout, step, jobs, active is not None and background.busy(scene.folder_of(active)))
+            _draw_next_step(layout, step, jobs, active is not None and background.is_busy(active))
         else:
             _draw_jobs(layout, jobs)
         if active is None:

@@ -25,7 +25,7 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
         state = folder_trust.state_of(root)
         job = background.job_of(root)
         column = layout.column()
-        column.enabled = not background.busy(folder)
+        column.enabled = not background.is_busy(root)
         column.operator("objectgs.extract_meshes", icon="MESH_DATA")
         column.row().prop(properties, "mesh_objects", expand=True)
         column.use_property_split = True
@@ -43,7 +43,7 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
                 "Extract Meshes continues it.",
                 "INFO",
             )
-        if state.stale_meshes and not background.busy(folder):
+        if state.stale_meshes and not background.is_busy(root):
             write(
                 layout,
                 f"{state.stale_meshes} of {state.meshes} meshes were made at another step of the training. "

@@ -44,7 +44,7 @@ class FilmPanel(WithReconstruction, bpy.types.Panel):
         root, settings, render = owner.objectgs.active, owner.objectgs_film, owner.render
         job = background.job_of(root)
         column = layout.column()
-        column.enabled = not background.busy(scene.folder_of(root))
+        column.enabled = not background.is_busy(root)
         column.operator("objectgs.film_frames", icon="RENDER_ANIMATION")
         column.use_property_split = True
         column.use_property_decorate = False

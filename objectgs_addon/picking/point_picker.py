@@ -58,15 +58,22 @@ class PointPicker:
 
     def pick(self, context: bpy.types.Context, event: bpy.types.Event) -> bool:
         """Add the point under the mouse; return False if there is none."""
-        region = next(region for region in context.area.regions if region.type == "WINDOW")
-        mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y], float)
-        place = nearest(
-            self.positions,
-            np.array(context.space_data.region_3d.perspective_matrix),
-            (region.width, region.height),
-            mouse,
-            REACH,
+        # Quad View has four of them.
+        region = next(
+            (
+                region
+                for region in context.area.regions
+                if region.type == "WINDOW"
+                and 0 <= event.mouse_x - region.x < region.width
+                and 0 <= event.mouse_y - region.y < region.height
+            ),
+            None,
         )
+        if region is None:
+            return False
+        mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y], float)
+        perspective = np.array(region.data.perspective_matrix)
+        place = nearest(self.positions, perspective, (region.width, region.height), mouse, REACH)
         if place is None:
             return False
         self.picked.append(tuple(float(value) for value in self.positions[place]))

@@ -134,8 +134,14 @@ def install_transformers(owner: bpy.types.Scene, report: Callable[[set[str], str
 
 
 def job_of(root: bpy.types.Collection) -> Job | None:
-    """Return the latest job in the queue for a reconstruction's folder, or None."""
-    return queue.of_folder(scene.folder_of(root))
+    """Return the latest job in the queue for a reconstruction's folder, or None; other folders are not looked at."""
+    return queue.of_folder(scene.folder_of(root)) if folder_trust.is_accepted(root) else None
+
+
+def is_busy(root: bpy.types.Collection) -> bool:
+    """Return whether the queue contains an unfinished job for a reconstruction, for panels."""
+    job = job_of(root)
+    return job is not None and not job.is_finished
 
 
 def failed_job(number: int) -> Job | None:

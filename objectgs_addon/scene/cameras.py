@@ -9,10 +9,12 @@ import numpy as np
 from mathutils import Matrix
 
 from ...backend.shared.reconstruction.cameras import Cameras, CameraView
-from .kinds import CAMERA, KIND, kind_of, mark
+from .kinds import CAMERA, KIND, POINTS, capture_of, kind_of, mark, parent_of
 
 SENSOR_WIDTH = 36.0
 LARGEST_ASPECT_ERROR = 0.01
+_NEAREST, _FARTHEST = 1e-3, 10.0
+"""Least clip distances, relative to the size of the scene."""
 DISPLAY_SIZE = 0.25
 """Display size of a camera relative to the median distance between nearest cameras."""
 
@@ -22,7 +24,11 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
 
     Existing cameras are matched by image name; those no longer in `cameras` are removed.
     """
-    there = {obj["objectgs_image"]: obj for obj in capture.objects if kind_of(obj) == CAMERA}
+    there: dict[str, bpy.types.Object] = {}
+    for obj in capture.objects:
+        if kind_of(obj) == CAMERA:
+            # Later ones are copies by the user.
+            there.setdefault(obj["objectgs_image"], obj)
     poses = [_pose(view, cameras.origin) for view in cameras.views]
     display = DISPLAY_SIZE * _spacing(np.array([pose[:3, 3] for pose in poses]))
     for view, pose in zip(cameras.views, poses):
@@ -49,6 +55,29 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
     return _warnings(cameras.views)
 
 
+def widen_clipping(root: bpy.types.Collection, cameras: Sequence[bpy.types.Object] | None = None) -> None:
+    """Let cameras of a reconstruction's capture, by default all, see from 1/1000 of the scene's size to ten times that.
+
+    Clip distances that are wider are kept.
+    """
+    capture, parent = capture_of(root), parent_of(root)
+    if capture is None or parent is None:
+        return
+    places = [np.zeros((0, 3))]
+    for part in capture.objects:
+        matrix = np.array(part.matrix_basis)
+        corners = np.array(part.bound_box) if kind_of(part) == POINTS else np.zeros((1, 3))
+        places.append(corners @ matrix[:3, :3].T + matrix[:3, 3])
+    every = np.concatenate(places)
+    if not len(every):
+        return
+    reach = float(np.linalg.norm(np.ptp(every, axis=0)) * max(map(abs, parent.matrix_world.to_scale())))
+    for camera in [part for part in capture.objects if kind_of(part) == CAMERA] if cameras is None else cameras:
+        data = camera.data
+        data.clip_start = min(data.clip_start, reach * _NEAREST)
+        data.clip_end = max(data.clip_end, reach * _FARTHEST)
+
+
 def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     """Make `camera` the scene's camera; for a capture camera, also set the render size and pixel aspect."""
     scene.camera = camera
@@ -63,6 +92,16 @@ def use_size(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     scene.render.resolution_x, scene.render.resolution_y = int(camera["width"]), int(camera["height"])
     scene.render.resolution_percentage = 100
     scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(aspect, 1.0), max(1.0 / aspect, 1.0)
+
+
+def has_size(scene: bpy.types.Scene, camera: bpy.types.Object) -> bool:
+    """Return whether the scene has the render size and pixel aspect of a capture camera's photo."""
+    render, aspect = scene.render, float(camera["pixel_aspect"])
+    size = render.resolution_x, render.resolution_y, render.resolution_percentage
+    pixel = render.pixel_aspect_x, render.pixel_aspect_y
+    return size == (int(camera["width"]), int(camera["height"]), 100) and np.allclose(
+        pixel, (max(aspect, 1.0), max(1.0 / aspect, 1.0))
+    )
 
 
 def _pose(view: CameraView, origin: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.formats.photos_source import read_photo_errors
 from ...backend.shared.reconstruction.cameras import read_cameras
 from . import carrier
-from .cameras import show_cameras, use_camera
+from .cameras import has_size, show_cameras, use_camera, use_size, widen_clipping
 from .kinds import (
     CAMERA,
     CAPTURE,
@@ -93,6 +93,9 @@ def show_capture(
         capture = bpy.data.collections.new(f"{root.name} capture")
         mark(capture, CAPTURE)
         adopt(capture, root, (CAMERA, POINTS))
+    before = set(capture.objects)
+    shot = scene.camera if scene.camera is not None and kind_of(scene.camera) == CAMERA else None
+    follows_photo = shot is not None and has_size(scene, shot)
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
     mark_uncertain(capture, {} if cameras.capture is None else read_photo_errors(cameras.capture))
     show_points(capture, parent, f"{root.name} points", points, cameras.origin, objects)
@@ -103,8 +106,11 @@ def show_capture(
     if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
         scene.collection.children.link(root)
     ours = [obj for obj in capture.objects if kind_of(obj) == CAMERA]
-    if ours and (scene.camera is None or scene.camera in ours):
-        use_camera(scene, scene.camera or min(ours, key=lambda obj: obj["objectgs_image"]))
+    widen_clipping(root, [camera for camera in ours if camera not in before])
+    if ours and scene.camera is None:
+        use_camera(scene, min(ours, key=lambda obj: obj["objectgs_image"]))
+    elif scene.camera in ours and follows_photo:
+        use_size(scene, scene.camera)
     return root
 
 

@@ -9,6 +9,8 @@ import bpy
 from mathutils import Matrix, Vector
 
 from ...backend.shared.errors import InputError
+from .cameras import widen_clipping
+from .edits.placement import matrix_to_world
 from .kinds import CAMERA, capture_of, kind_of, parent_of
 
 SMALLEST_SINE = 1e-3
@@ -68,6 +70,7 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
     if not 0.0 < distance < float("inf"):
         raise InputError("The distance must be greater than 0.")
     _move(parent, Matrix.Scale(distance / apart, 4))
+    widen_clipping(root)
 
 
 def _parent(root: bpy.types.Collection) -> bpy.types.Object:
@@ -88,4 +91,5 @@ def _camera_centers(root: bpy.types.Collection) -> list[Vector]:
     if capture is None:
         return []
     bpy.context.view_layer.update()
-    return [obj.matrix_world.translation.copy() for obj in capture.objects if kind_of(obj) == CAMERA]
+    # Blender does not update the matrices of cameras in a collection that is excluded from the view layer.
+    return [Vector(matrix_to_world(obj)[:3, 3]) for obj in capture.objects if kind_of(obj) == CAMERA]

@@ -12,6 +12,11 @@ from ...objectgs_addon.picking import point_picker
 from ..common import need
 from ..common.reporting import reports_errors
 
+_NAVIGATION = {
+    "MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE", "TRACKPADPAN", "TRACKPADZOOM", "MOUSEROTATE", "MOUSESMARTZOOM",
+}  # fmt: skip
+"""Events that turn, move or zoom the view."""
+
 
 class _PicksPoints:
     """Modal part: clicks collect the nearest points of the reconstruction, then `finish` uses them."""
@@ -45,7 +50,7 @@ class _PicksPoints:
         if event.type in {"ESC", "RIGHTMOUSE"}:
             self.picker.end(context)
             return {"CANCELLED"}
-        if event.type in {"MIDDLEMOUSE", "WHEELUPMOUSE", "WHEELDOWNMOUSE"} or event.type.startswith("NUMPAD"):
+        if event.type in _NAVIGATION or event.type.startswith(("NUMPAD", "NDOF_")):
             return {"PASS_THROUGH"}
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             if not self.picker.pick(context, event):

@@ -22,7 +22,7 @@ class DuplicateObject(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.not_removed(cls, context, "; restore it first")
+        return need.not_removed(cls, context, "; restore it first") and need.object_mode(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:

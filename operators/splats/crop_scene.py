@@ -26,6 +26,10 @@ class AddCropBox(_OnSplats, bpy.types.Operator):
         "crop. Move, rotate and scale it, then apply the crop"
     )
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return super().poll(context) and need.object_mode(cls, context)
+
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)

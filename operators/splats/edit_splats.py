@@ -75,7 +75,7 @@ class SeparateSplats(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return need.objects(cls, context)
+        return need.objects(cls, context) and need.object_mode(cls, context)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:

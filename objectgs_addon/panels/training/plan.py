@@ -8,7 +8,6 @@ from typing import Any
 import bpy
 
 from ....backend.shared.reconstruction.plan import Decision
-from ... import scene
 from ...running import background
 from ...running.job_display import write
 from ...state import planning
@@ -32,8 +31,7 @@ class PlanPanel(WithReconstruction, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = self.layout
         root = context.scene.objectgs.active
-        folder = scene.folder_of(root)
-        layout.enabled = not background.busy(folder)
+        layout.enabled = not background.is_busy(root)
         for decision in planning.plan_for(root).decisions:
             _draw_decision(layout, root.objectgs, decision)
         row = layout.row(align=True)

@@ -34,7 +34,7 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         properties = root.objectgs
         folder = scene.folder_of(root)
         job = _training_job(root)
-        active = background.busy(folder)
+        active = background.is_busy(root)
         state = folder_trust.state_of(root)
         column = layout.column()
         column.enabled = not active

@@ -104,7 +104,13 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
     Recolored textures are replaced by recolored images, since exporters do not support the recolor node group.
     """
     window = bpy.context.window or bpy.context.window_manager.windows[0]
-    before = window.scene
+    before, layer = window.scene, window.view_layer
+    seen_from = [
+        (space.region_3d, space.region_3d.view_perspective)
+        for area in window.screen.areas
+        for space in area.spaces
+        if space.type == "VIEW_3D"
+    ]
     stage = bpy.data.scenes.new("ObjectGS export")
     made, copies = [], {}
     try:
@@ -132,6 +138,10 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
             yield
     finally:
         window.scene = before
+        window.view_layer = layer
+        for region, perspective in seen_from:
+            # A scene without a camera ends the view through it.
+            region.view_perspective = perspective
         for obj in made:
             bpy.data.objects.remove(obj)
         for material, images in copies.values():
