@@ -6,6 +6,7 @@ They are made of those of another program, or of the segments that a model finds
 from __future__ import annotations
 
 import argparse
+import zlib
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -66,6 +67,20 @@ class _Former(NamedTuple):
     largest_id: int
 
 
+class _Packed:
+    """The segments of a photo, as in `Segments`, with compressed numbers, since those of all photos are kept."""
+
+    def __init__(self, segments: Segments) -> None:
+        self.objects, self.names, self.shape = segments.objects, segments.names, segments.numbers.shape
+        self._kind = np.min_scalar_type(len(self.objects))
+        self._numbers = zlib.compress(segments.numbers.astype(self._kind).tobytes(), 1)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """(h, w) int32."""
+        return np.frombuffer(zlib.decompress(self._numbers), self._kind).reshape(self.shape).astype(np.int32)
+
+
 def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Read or find the segments of the photos, find the objects where IDs differ between photos, and write masks/."""
     options.masks = chosen_checkpoint(options.masks)
@@ -92,7 +107,7 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         source = open_source(given, capture, names)
     photos = [name for name in source.photos if name in set(names)]
     images = Photos(capture).folder
-    segments = {name: _checked(source, name, images, given) for name in _counted(photos, reporter)}
+    segments = {name: _Packed(_checked(source, name, images, given)) for name in _counted(photos, reporter)}
     if not any(found.objects for found in segments.values()):
         if options.text is not None:
             raise InputError(f"No photo shows {_listed(options.text)} as far as the model finds; use other words.")
@@ -199,7 +214,7 @@ def _checked(source: MaskSource, name: str, images: Path, given: Path) -> Segmen
 
 
 def _objects(
-    segments: dict[str, Segments], model: Model | None, how: str, former: _Former, reporter: StoppingReporter
+    segments: dict[str, _Packed], model: Model | None, how: str, former: _Former, reporter: StoppingReporter
 ) -> tuple[_Found, Association | None, dict[str, Seen]]:
     """Return the objects of the segments: those that the source says, or those found by the model's points."""
     seen = {} if model is None else _seen(segments, model)
@@ -245,7 +260,7 @@ def _former(capture: Path, photos: Sequence[str]) -> _Former:
 
 
 def _with_former_ids(
-    association: Association, segments: dict[str, Segments], seen: dict[str, Seen], former: _Former
+    association: Association, segments: dict[str, _Packed], seen: dict[str, Seen], former: _Former
 ) -> Association:
     """Return the objects with the IDs that they have in the former masks."""
     ids, largest = {}, former.largest_id
@@ -257,7 +272,7 @@ def _with_former_ids(
         except InputError:
             continue  # It is replaced now, so that it may be damaged.
         rows, columns = (
-            at * own // whole for at, own, whole in zip(photo.xy.T[::-1], mask.shape, segments[name].numbers.shape)
+            at * own // whole for at, own, whole in zip(photo.xy.T[::-1], mask.shape, segments[name].shape)
         )
         ids[index] = mask[rows, columns]
         largest = max(largest, int(mask.max(initial=0)))
@@ -265,7 +280,7 @@ def _with_former_ids(
 
 
 def _warn_of_missing(
-    names: Sequence[str], segments: dict[str, Segments], found: _Found, reporter: StoppingReporter
+    names: Sequence[str], segments: dict[str, _Packed], found: _Found, reporter: StoppingReporter
 ) -> None:
     """Warn of names that no segment has, and of those that segments have, but no object."""
     shown = {name for own in segments.values() for name in own.names}
@@ -282,7 +297,7 @@ def _listed(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def _given(segments: dict[str, Segments], former: _Former) -> _Found:
+def _given(segments: dict[str, _Packed], former: _Former) -> _Found:
     """Return the objects that the source says; whole numbers are IDs, and others get former or new ones."""
     known = {key for found in segments.values() for key in found.objects}
     numbers: dict[Hashable, int] = {key: key for key in known if isinstance(key, int) and 0 < key <= LARGEST_ID}
@@ -295,7 +310,7 @@ def _given(segments: dict[str, Segments], former: _Former) -> _Found:
     return _Found(ids, {**_names(segments, ids), **texts})
 
 
-def _names(segments: dict[str, Segments], ids: dict[str, np.ndarray]) -> dict[int, str]:
+def _names(segments: dict[str, _Packed], ids: dict[str, np.ndarray]) -> dict[int, str]:
     """Return the most frequent name of each object's segments."""
     named: dict[int, Counter[str]] = {}
     for photo, of in ids.items():
@@ -306,7 +321,7 @@ def _names(segments: dict[str, Segments], ids: dict[str, np.ndarray]) -> dict[in
     return {object_id: name if count else default_name(object_id) for object_id, (name, count) in common.items()}
 
 
-def _seen(segments: dict[str, Segments], model: Model) -> dict[str, Seen]:
+def _seen(segments: dict[str, _Packed], model: Model) -> dict[str, Seen]:
     """Return the points that each photo with masks shows, and their segments."""
     images = [image for image in model.images if image.name in segments]
     seen = {}
@@ -329,7 +344,7 @@ def _seen(segments: dict[str, Segments], model: Model) -> dict[str, Seen]:
 
 
 def _drawn(
-    segments: dict[str, Segments],
+    segments: dict[str, _Packed],
     found: _Found,
     association: Association | None,
     seen: dict[str, Seen],
