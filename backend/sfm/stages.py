@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import psutil
+from numba import get_num_threads
 
 from ..shared.errors import Cancelled, InputError
 from ..shared.stopping import StoppingReporter
@@ -23,7 +24,7 @@ _STOPPED = "Stopped; features and matches are kept. Run the same command again t
 def run_stage(
     reporter: StoppingReporter, log: Path, arguments: list[str], count: Callable[[int], int], total: int
 ) -> bool:
-    """Run a stage of `backend.sfm.worker` until it ends.
+    """Run a stage of `backend.sfm.worker`, with as many threads as kernels have, until it ends.
 
     Args:
         reporter: receives progress; its request to pause suspends the process, and that to stop ends it.
@@ -48,7 +49,7 @@ def run_stage(
 
     with log.open("ab") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "backend.sfm.worker", *arguments],
+            [sys.executable, "-m", "backend.sfm.worker", str(get_num_threads()), *arguments],
             cwd=_ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors,
         )  # fmt: skip
         reading = threading.Thread(target=read, args=(process.stdout,), daemon=True)

@@ -1,5 +1,7 @@
 """One stage of COLMAP in a process of its own, since it cannot be stopped otherwise: `python -m backend.sfm.worker`.
 
+The first argument is the number of threads, followed by the stage and its arguments:
+
     worker extract DATABASE IMAGES GROUPS.json [MASKS]   features of the photos in each group, which share a camera
     worker match DATABASE [PAIRS.txt]   matches of the pairs, or of all
     worker extract-learned MODEL DATABASE IMAGES GROUPS.json [MASKS]   as extract, by the networks of a checkpoint
@@ -61,6 +63,8 @@ _TRIALS = 2000
 beyond are pairs with few inliers, 2% of all matches."""
 _ERRORS = 2
 """Level of COLMAP's messages from which on they are kept."""
+_threads = -1
+"""Number of threads of this process; -1: all cores."""
 _FAINT = 0.003
 """Least contrast of a feature, below COLMAP's 0.0067: plain or small photos have too few otherwise, and others reach
 `MOST_FEATURES` anyway."""
@@ -79,7 +83,7 @@ def extract(database: str, images: str, groups: str, masks: str = "") -> None:
             reader.mask_path = masks
         reader.existing_camera_id = camera_of(Path(database), group.names)
         options = pycolmap.FeatureExtractionOptions()
-        options.use_gpu = False
+        options.use_gpu, options.num_threads = False, _threads
         options.max_image_size = LONGEST_SIDE
         options.sift.max_num_features = MOST_FEATURES
         options.sift.peak_threshold = _FAINT
@@ -117,7 +121,7 @@ def _calibrate(database: str, group: _Group) -> None:
 def match(database: str, pairs: str = "") -> None:
     """Match and verify pairs of photos, those in a file or all."""
     options = pycolmap.FeatureMatchingOptions()
-    options.use_gpu = False
+    options.use_gpu, options.num_threads = False, _threads
     if pairs:
         listed = pycolmap.ImportedPairingOptions()
         listed.match_list_path, listed.block_size = pairs, _BLOCK
@@ -184,7 +188,7 @@ def map_incrementally(database: str, images: str, out: str, names: str, calibrat
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
-    options.random_seed, options.min_model_size = SEED, FEWEST_POSES
+    options.random_seed, options.min_model_size, options.num_threads = SEED, FEWEST_POSES, _threads
 
     def tell() -> None:
         print("pose", flush=True)
@@ -199,7 +203,7 @@ def map_globally(database: str, images: str, out: str, names: str, calibrated: s
         adjustment = options.mapper.bundle_adjustment
         adjustment.refine_focal_length = adjustment.refine_extra_params = False
     options.image_names = json.loads(Path(names).read_text(encoding="utf-8"))
-    options.random_seed, options.min_model_size = SEED, FEWEST_POSES
+    options.random_seed, options.min_model_size, options.num_threads = SEED, FEWEST_POSES, _threads
     pycolmap.global_mapping(database, images, out, options=options)
 
 
@@ -300,6 +304,7 @@ def adjust(model: pycolmap.Reconstruction, keep_lens: bool = False) -> None:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = max(_SPREAD * _typical(residuals(model)), _FINEST)
     options.ceres.solver_options.function_tolerance = _SETTLED
+    options.ceres.solver_options.num_threads = _threads
     pycolmap.bundle_adjustment(model, options)
 
 
@@ -346,8 +351,12 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def main(name: str, *arguments: str) -> None:
-    """Run a stage."""
+def main(threads: str, name: str, *arguments: str) -> None:
+    """Run a stage with a number of threads."""
+    global _threads
+    _threads = int(threads)
+    # Before torch is imported, for the networks.
+    os.environ["OMP_NUM_THREADS"] = threads
     threading.Thread(target=_end_with, args=(take_stdin(),), daemon=True).start()
     pycolmap.logging.minloglevel = _ERRORS
     STAGES[name](*arguments)

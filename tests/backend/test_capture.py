@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from backend.capture import check_capture, load_capture
 from backend.capture.capture import HOLDOUT_EVERY
@@ -207,6 +207,38 @@ def test_pixels_of_tiffs_are_taken_as_stored(tmp_path, orientation, compression)
     Image.fromarray(pixels).save(path, compression=compression, tiffinfo={274: orientation})
     assert image_size(path) == (30, 20)
     assert np.array_equal(np.asarray(read_image(path)), pixels)
+
+
+def exchanged_profile() -> bytes:
+    """Return an ICC profile like sRGB, whose red is blue and whose blue is red."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    end = 132 + 12 * int.from_bytes(profile[128:132], "big")
+    table = profile[:end].replace(b"rXYZ", b"_XYZ").replace(b"bXYZ", b"rXYZ").replace(b"_XYZ", b"bXYZ")
+    return table + profile[end:].replace("sRGB".encode("utf-16-be"), "mine".encode("utf-16-be"))
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.tif"])
+def test_colors_are_those_of_the_profile(tmp_path, mode, name):
+    if (mode, name) == ("RGBA", "a.jpg"):
+        pytest.skip("JPEG has no alpha")
+    pixels = np.kron(np.random.default_rng(0).integers(0, 256, (4, 6, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+    image = Image.fromarray(pixels)
+    if mode == "RGBA":
+        image.putalpha(0)
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for profile, expected in ((exchanged_profile(), pixels[..., ::-1]), (srgb, pixels), (b"damaged", pixels)):
+        image.save(tmp_path / name, icc_profile=profile, quality=100, subsampling=0)
+        found = np.asarray(read_image(tmp_path / name), int)
+        assert np.abs(found - expected).max() <= (6 if name == "a.jpg" else 2 if profile != srgb else 0), len(profile)
+
+
+def test_gray_and_cmyk_photos_are_read(tmp_path):
+    gray = np.random.default_rng(0).integers(0, 256, (20, 30)).astype(np.uint8)
+    Image.fromarray(gray).save(tmp_path / "gray.png", icc_profile=exchanged_profile())
+    assert np.array_equal(np.asarray(read_image(tmp_path / "gray.png"))[..., 1], gray), "a profile of other channels"
+    Image.new("CMYK", (30, 20), (0, 255, 255, 0)).save(tmp_path / "ink.tif")
+    assert np.asarray(read_image(tmp_path / "ink.tif"))[5, 5].tolist() == [255, 0, 0]
 
 
 def test_image_cache_limits_memory_across_threads(write_capture, tmp_path):

@@ -356,8 +356,16 @@ def test_spz_matches_gsply_reader(tmp_path):
     np.testing.assert_allclose(np.abs((found.quats * mine.quats).sum(1)), 1, atol=1e-5)
 
 
-def test_spz_limits_are_reported(tmp_path):
+def test_spz_limits_are_reported(tmp_path, monkeypatch):
     splats = some_splats()
+    tiny = splats.select(slice(0, 9))
+    tiny.means, tiny.scales = tiny.means * 1e-7, tiny.scales * 1e-7
+    assert any("scale them up" in warning for warning in write_spz(tmp_path / "tiny.spz", tiny))
+    with monkeypatch.context() as patched:
+        patched.setattr("backend.export.spz._MOST_SPLATS", 59)
+        with pytest.raises(InputError, match="60 splats are more than the 59"):
+            write_spz(tmp_path / "many.spz", splats)
+    assert not (tmp_path / "many.spz").exists()
     splats.means += 1e6
     (warning,) = write_spz(tmp_path / "far.spz", splats)
     assert "rounds positions" in warning

@@ -96,9 +96,20 @@ def test_masks_made_after_the_training_give_splats_their_objects(write_capture, 
     (scene.folder / "labels.json").unlink()
     assert run_command("train", scene.folder, "--out", out, "--steps", 2 * STEPS, "--offsets", 4).code == EXIT_DONE
     assert_rejected(run_command("clean-labels", out), "has no masks")
-    later.rename(scene.folder / "masks")
+    masks = later.rename(scene.folder / "masks")
+    # As the command that made them of others has written it.
+    (masks / "masks.json").write_text('{"objects": [{"id": 1, "name": "ball"}], "largest_id": 9}')
+    given = {path.name: path.read_bytes() for path in masks.iterdir()}
     assert run_command("clean-labels", out).code == EXIT_DONE
     assert rendered(scene, out) > 0.95
+    made = {path.name: path.read_bytes() for path in masks.iterdir()}
+    held_out = [scene.names[index] for index in load_capture(scene.folder, tmp_path / "cache").test_indices]
+    for name in ("masks.json", *(f"{name[:-4]}.png" for name in held_out)):
+        assert made[name] == given[name], "they are kept as they are"
+    for name in ("masks.json", "repair.json"):
+        (masks / name).unlink()
+    assert_rejected(run_command("clean-labels", out), "masks-given", "move it elsewhere")
+    assert {path.name for path in masks.iterdir()} == made.keys() - {"masks.json", "repair.json"}
 
 
 def test_splats_of_another_program_get_objects_by_later_masks(write_capture, tmp_path, run_command) -> None:

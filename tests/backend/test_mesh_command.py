@@ -95,6 +95,7 @@ def test_merged_objects_sets_and_scene_are_meshed(trained, run_command):
         (("--objects", "7"), ("no object 7", "1 sphere 1")),
         (("--objects", "teapot"), ("no object teapot", "sphere 5")),
         (("--set", "1=1,2"), ("--set 1=",)),
+        (("--set", "a=1,2", "--set", "a=5"), ("--set a=", "twice")),
         (("--set", "pair"), ("NAME=ID,ID",)),
         (("--faces", "3"), ("of at least 100",)),
         (("--texture-size", "1000"), ("1000",)),

@@ -333,6 +333,17 @@ def test_ball_is_reconstructed_accurately():
     assert surface.unobserved.mean() < 0.02
 
 
+def test_many_pixels_need_little_memory(monkeypatch):
+    shape = ball((0.03, -0.02, 0.05), 0.5)
+    views = ExactViews([shape], around(12))
+    whole = fuse(views, [0])
+    monkeypatch.setattr("backend.mesh.field.fusion._MOST_POINTS", 3000)
+    field = fuse(views, [0])
+    assert field.voxel == pytest.approx(whole.voxel, rel=0.03)
+    assert errors(extract(field), shape).mean() < 0.12 * field.voxel
+    assert volume(extract(field)) == pytest.approx(volume(extract(whole)), rel=0.01)
+
+
 def test_box_far_from_origin_is_accurate():
     low, high = np.array([1000.1, 0.2, -0.3]), np.array([1000.7, 0.5, 0.3])
     cameras = []

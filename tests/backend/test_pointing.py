@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from backend.capture import load_capture
 from backend.commands.objects.pointable import open_pointable
 from backend.export.ply import read_splats
+from backend.model.anchors import Anchors
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
@@ -737,6 +738,25 @@ def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:
     assert np.array_equal(stand_in.pictures[scene.names[1]], photo)
     _, points, labels = stand_in.prompts[0]
     assert labels.tolist() == [1, 0, 0] and len(points) == 3, "strokes on others in the view are not on it"
+
+
+def test_masks_have_no_object_where_no_splats_are(unlabeled) -> None:
+    """Even if all splats are of objects."""
+    scene, out = unlabeled
+    capture = load_capture(scene.folder, out / "cache")
+    model, _, _ = load_model(out / "checkpoint")
+    keep = torch.from_numpy(model.anchors.positions.numpy()[:, 0] > 0.1)
+    anchors = model.anchors
+    model.anchors = Anchors(
+        anchors.layout, anchors.voxel, anchors.positions[keep], anchors.rows[keep], anchors.ids[keep]
+    )
+    pointer = pointer_of(capture, model)
+    ids = np.full(len(pointer.splats.means), 70_000)
+    for (index, mask), (_, shown) in zip(
+        pointer.masks(ids), pointer.shown_ids(ids, capture.train_indices), strict=True
+    ):
+        assert set(np.unique(mask)) <= {0, 70_000}
+        assert 0.1 < (mask == 0).mean() < 0.98 and (mask == shown).mean() > 0.9, index
 
 
 def test_merged_objects_are_what_they_were(unlabeled) -> None:

@@ -22,7 +22,9 @@ from backend.commands.capture import sfm as sfm_command
 from backend.sfm import agreement, check, database, pairs, stages, worker
 from backend.sfm.former_frame import Pose, similarity
 from backend.sfm.model import centers_of
+from backend.sfm.sources.photos import Photo
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
+from backend.shared.events import Reporter
 from backend.shared.formats import photos_source
 
 from .command_result import assert_rejected
@@ -365,6 +367,11 @@ def test_folders_of_others_are_kept(photos, tmp_path, run_command, made):
     (tmp_path / "mine" / "letter.txt").write_text("Dear")
     result = run_command("sfm", photos, "--out", tmp_path / "mine")
     assert result.code == EXIT_BAD_INPUT and "contains other files" in result.err
+    (tmp_path / "theirs" / "sfm").mkdir(parents=True)
+    (tmp_path / "theirs" / "sfm" / database.NAME).write_bytes(b"of another program")
+    result = run_command("sfm", photos, "--out", tmp_path / "theirs")
+    assert result.code == EXIT_BAD_INPUT and "contains other files" in result.err
+    assert (tmp_path / "theirs" / "sfm" / database.NAME).read_bytes() == b"of another program"
     other = shutil.copytree(made, tmp_path / "model")
     shutil.rmtree(other / "sfm")
     result = run_command("sfm", other, "--out", other)
@@ -453,6 +460,7 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
     out = tmp_path / "capture"
     (out / "sfm").mkdir(parents=True)
+    shutil.copy(made / "sfm" / "source.json", out / "sfm")
     path = out / "sfm" / database.NAME
     shutil.copy(made / "sfm" / database.NAME, path)
     with closing(sqlite3.connect(path)) as connection, connection:
@@ -464,6 +472,19 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     assert run_command("sfm", photos, "--out", out).code == EXIT_DONE
     assert set(database.image_ids(path)) == posed_photos(out) == {f"photo {i}.png" for i in range(1, VIEWS + 1)}
     assert len(database.verified_pairs(path)) >= VIEWS - 1
+
+
+def test_photos_to_leave_out_are_found_by_the_names_that_they_had():
+    photos_there = [Photo(name, "", "") for name in ("a/1.jpg", "a/2.png", "b/e\u0301.jpg")]
+    told = []
+
+    class Told(Reporter):
+        def warning(self, message: str) -> None:
+            told.append(message)
+
+    asked = ["a/1.HEIC", "b/\u00e9.jpg", "a/3.jpg"]
+    assert list(sfm_command._unwanted(asked, photos_there, Told())) == ["a/1.jpg", "b/e\u0301.jpg"]
+    assert len(told) == 1 and "a/3.jpg" in told[0] and "1.HEIC" not in told[0]
 
 
 def test_cameras_are_others_if_photos_share_them_in_another_way():
@@ -491,7 +512,7 @@ def test_stage_ends_with_the_process_that_began_it():
     """Or the next one would find its database in use."""
     program = "import time; from backend.sfm import worker; worker.STAGES['wait'] = lambda: time.sleep(60); "
     process = subprocess.Popen(
-        [sys.executable, "-c", f"{program}print(1, flush=True); worker.main('wait')"],
+        [sys.executable, "-c", f"{program}print(1, flush=True); worker.main('1', 'wait')"],
         cwd=stages._ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
     )  # fmt: skip
     assert process.stdin is not None and process.stdout is not None

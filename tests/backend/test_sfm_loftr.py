@@ -344,7 +344,7 @@ def test_killed_matching_goes_on(network, photos, tmp_path):
     matched, listed = tmp_path / "p.db", tmp_path / "pairs.txt"
     chosen = list(combinations(names[:4], 2))
     database.write_pairs(listed, chosen)
-    command = [sys.executable, "-m", "backend.sfm.worker", "match-places", network, matched, images, listed]
+    command = [sys.executable, "-m", "backend.sfm.worker", "1", "match-places", network, matched, images, listed]
     process = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"OMP_NUM_THREADS": "1"}, stdin=subprocess.PIPE)
     until = time.monotonic() + 60
     while database.count_positions(matched) < 2 and process.poll() is None and time.monotonic() < until:

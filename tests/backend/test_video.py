@@ -398,7 +398,8 @@ def test_doubles_and_live_photos_are_taken_once(tmp_path):
     folder.mkdir()
     for name in ("a.jpg", "a.heic", "b.heic", "c.jpg"):
         heic(folder / name)
-    (folder / "a.cr2").write_bytes(b"II*\0")
+    for name in ("a.cr2", "b.cr3"):
+        (folder / name).write_bytes(b"II*\0")
     write_video(folder / "b.mov", pan(3))
     taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
     assert [photo.name for photo in taken.photos] == ["a.jpg", "b.jpg", "c.jpg"] and not taken.unreadable
@@ -422,6 +423,48 @@ def test_other_number_of_frames_replaces_them(tmp_path):
         assert len(taken.photos) == count and taken.in_order
         kept = sorted(path.name for path in (tmp_path / "capture" / "images").iterdir())
         assert kept == [photo.name for photo in taken.photos]
+
+
+def test_frames_of_another_video_have_no_features_of_the_former_one(tmp_path, monkeypatch):
+    removed = []
+    monkeypatch.setattr(photos.database, "remove_all", removed.append)
+    film, work = tmp_path / "a.mp4", tmp_path / "capture" / "sfm"
+    work.mkdir(parents=True)
+    write_video(film, pan(40))
+    for count in (12, 12, 5):
+        photos.take_photos([film], tmp_path / "capture", count, reporter())
+    assert not removed
+    write_video(film, pan(20))
+    monkeypatch.setattr(video, "write_frames", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        photos.take_photos([film], tmp_path / "capture", 5, reporter())
+    assert removed == [work] and json.loads((work / photos.FRAMES).read_text()) == {}, "it was ended in between"
+
+
+def test_a_digital_zoom_is_another_camera(tmp_path):
+    found = []
+    for number, length in enumerate((28, 56, 28)):
+        image, exif = Image.fromarray(texture(2)[:120, :160].astype(np.uint8)), Image.Exif()
+        details = exif.get_ifd(0x8769)
+        details[0x920A], details[0xA405] = 4.25, length
+        image.save(tmp_path / f"{number}.jpg", exif=exif)
+        found.append(photo_files.camera_of(tmp_path / f"{number}.jpg", True))
+    assert found[0] == found[2] != found[1]
+
+
+def test_raw_photos_of_another_size_or_lens_have_another_camera(tmp_path):
+    def raw(name, size, length):
+        image, exif = Image.new("RGB", (16, 12)), Image.Exif()
+        exif.get_ifd(0x8769)[0x920A] = length
+        image.save(tmp_path / name, "TIFF", exif=exif)
+        Image.new("RGB", size).save(tmp_path / "developed.png")
+        return photo_files.camera_of_raw(tmp_path / name, tmp_path / "developed.png")
+
+    first = raw("a.nef", (60, 40), 50.0)
+    assert first.split(" ")[0] == "60x40" and first == raw("b.nef", (60, 40), 50.0)
+    assert len({first, raw("c.nef", (40, 60), 50.0), raw("d.nef", (60, 40), 35.0)}) == 3
+    (tmp_path / "e.cr3").write_bytes(b"unknown to Pillow")
+    assert photo_files.camera_of_raw(tmp_path / "e.cr3", tmp_path / "developed.png").startswith("60x40 .cr3")
 
 
 def test_raw_photos_need_their_package(tmp_path, monkeypatch):
