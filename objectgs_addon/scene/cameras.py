@@ -13,7 +13,7 @@ from .kinds import CAMERA, KIND, POINTS, capture_of, kind_of, mark, parent_of
 
 SENSOR_WIDTH = 36.0
 LARGEST_ASPECT_ERROR = 0.01
-_NEAREST, _FARTHEST = 1e-3, 10.0
+_NEAREST, _FARTHEST = 1 / 200, 10.0
 """Least clip distances, relative to the size of the scene."""
 DISPLAY_SIZE = 0.25
 """Display size of a camera relative to the median distance between nearest cameras."""
@@ -56,7 +56,7 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
 
 
 def widen_clipping(root: bpy.types.Collection, cameras: Sequence[bpy.types.Object] | None = None) -> None:
-    """Let cameras of a reconstruction's capture, by default all, see from 1/1000 of the scene's size to ten times that.
+    """Let cameras of a reconstruction's capture, by default all, see from 1/200 of the scene's size to ten times that.
 
     Clip distances that are wider are kept.
     """

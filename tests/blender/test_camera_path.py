@@ -14,6 +14,7 @@ from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.film.camera_path import path_order
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background
+from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state import folder_trust
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import next_step
@@ -51,6 +52,20 @@ def test_unordered_cameras_are_put_in_order():
     centers = circle(20)[shuffle]
     found = shuffle[path_order(centers)]
     assert found.tolist() == list(range(20))
+
+
+def test_path_passes_through_views_of_an_excluded_capture(root):
+    capture = kinds.capture_of(root)
+    first = min((part for part in capture.objects if scene.kind_of(part) == "camera"), key=lambda part: part.name)
+    first.data.clip_end = 77.0
+    bpy.context.view_layer.layer_collection.children[root.name].children[capture.name].exclude = True
+    kinds.parent_of(root).scale = (3, 3, 3)
+    bpy.context.view_layer.update()
+    assert bpy.ops.objectgs.camera_path() == {"FINISHED"}
+    moving = bpy.context.scene.camera
+    bpy.context.scene.frame_set(bpy.context.scene.frame_start)
+    assert np.linalg.norm(moving.location) == pytest.approx(np.linalg.norm(scene.matrix_to_world(first)[:3, 3]), 1e-4)
+    assert np.linalg.norm(moving.location) > 8 and moving.data.clip_end == 77.0
 
 
 def test_path_passes_through_captured_views(root):

@@ -705,9 +705,14 @@ def test_exported_meshes_have_edits(root, tmp_path, suffix):
     activate(root, 1)
     bpy.ops.objectgs.duplicate_object()
     before = {name: len(getattr(bpy.data, name)) for name in ("objects", "meshes", "materials", "images", "scenes")}
+    window = bpy.context.window_manager.windows[0]
+    layer, own = bpy.context.scene.view_layers[0], bpy.context.scene.view_layers.new("mine")
+    window.view_layer = own
     assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format=suffix, coordinates="capture") == {
         "FINISHED"
     }
+    assert window.view_layer == own
+    window.view_layer = layer
     assert (tmp_path / f"all.{suffix}").stat().st_size > 100
     assert {name: len(getattr(bpy.data, name)) for name in before} == before
     if suffix == "obj":

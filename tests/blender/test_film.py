@@ -222,6 +222,24 @@ def test_objects_hidden_in_renders_are_omitted(root):
     assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
 
 
+def test_hidden_camera_follows_its_constraints(root):
+    scene = bpy.context.scene
+    dolly, aim = (bpy.data.objects.new(name, None) for name in ("dolly", "aim"))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.parent = dolly
+    dolly.location, aim.location = (0, -4, 1), (0, 0, 0.5)
+    for obj in (dolly, aim, camera):
+        scene.collection.objects.link(obj)
+    tracks = camera.constraints.new("TRACK_TO")
+    tracks.target, tracks.track_axis, tracks.up_axis = aim, "TRACK_NEGATIVE_Z", "UP_Y"
+    scene.camera = camera
+    bpy.context.view_layer.update()
+    seen = shoot(root).frames[0].samples[0].viewmat
+    camera.hide_set(True)
+    bpy.context.view_layer.update()
+    assert shoot(root).frames[0].samples[0].viewmat == pytest.approx(seen)
+
+
 def test_duplicates_and_instances_are_included(root):
     """A duplicated object, and an empty that instances a collection elsewhere."""
     scene = bpy.context.scene

@@ -19,6 +19,7 @@ from objectgs.backend.shared.reconstruction.objects import edit_objects, read_ob
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.environment import known_folders
 from objectgs.objectgs_addon.film import properties as film
+from objectgs.objectgs_addon.panels import CLASSES
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
@@ -26,6 +27,7 @@ from objectgs.objectgs_addon.state import folder_trust, object_edits
 from objectgs.operators.film.output_folder import UsesOutputFolder
 
 from .building import HUGE, write_folder
+from .drawn import texts_of
 
 REMOTE = r"\\elsewhere\share\rec"
 
@@ -167,6 +169,10 @@ def test_the_folder_is_not_even_looked_at(root, monkeypatch, tmp_path):
     opened(tmp_path / "remote.blend")
     for name in dir(bpy.ops.objectgs):
         getattr(bpy.ops.objectgs, name).poll()
+    for panel in (cls for cls in CLASSES if issubclass(cls, bpy.types.Panel) and not hasattr(cls, "preset_subdir")):
+        if getattr(panel, "poll", lambda _context: True)(bpy.context):
+            texts_of(panel)
+    assert not background.is_busy(active()) and background.job_of(active()) is None
     assert not folder_trust.state_of(active()).exists and not touched
     assert not edits_of_plan(active())
 

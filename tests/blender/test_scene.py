@@ -120,6 +120,50 @@ def test_user_camera_and_render_size_are_kept(fresh, folder):
     assert owner.view_settings.view_transform == view_transform
 
 
+def test_update_keeps_copied_cameras_and_the_render_size(root, folder):
+    owner, capture = bpy.context.scene, kinds.capture_of(root)
+    original = cameras_of(root)[2]
+    copy = original.copy()
+    copy.data = original.data.copy()
+    copy.location, copy.data.lens = (7, 8, 9), 12
+    capture.objects.link(copy)
+    poses = json.loads((folder / "cameras.json").read_text())
+    poses["cameras"][2]["viewmat"][2][3] += 0.5
+    (folder / "cameras.json").write_text(json.dumps(poses))
+    before = original.location.copy()
+    owner.render.resolution_x, owner.render.resolution_percentage = 1920, 50
+    blender_scene.show_capture(owner, folder)
+    assert (original.location - before).length == pytest.approx(0.5, abs=1e-4)
+    assert tuple(copy.location) == (7, 8, 9) and copy.data.lens == 12
+    assert (owner.render.resolution_x, owner.render.resolution_percentage) == (1920, 50)
+    # Where the size is still that of the photo, it follows the photo.
+    blender_scene.use_camera(owner, original)
+    for camera in poses["cameras"]:
+        camera["width"] *= 2
+    (folder / "cameras.json").write_text(json.dumps(poses))
+    blender_scene.show_capture(owner, folder)
+    assert owner.render.resolution_x == original["width"] == poses["cameras"][2]["width"]
+
+
+def test_capture_that_was_moved_in_the_outliner_is_updated(root, folder):
+    owner, capture = bpy.context.scene, kinds.capture_of(root)
+    owner.collection.children.link(capture)
+    root.children.unlink(capture)
+    before = counts()
+    assert blender_scene.show_capture(owner, folder) == root
+    assert counts() == before and kinds.capture_of(root) == capture
+
+
+def test_cameras_see_the_scene_whatever_its_size(root):
+    cameras = cameras_of(root)
+    assert all(camera.data.clip_end == 1000 for camera in cameras)
+    blender_scene.scale_to_distance(root, (0, 0, 0), (1, 0, 0), 5000.0)
+    assert all(camera.data.clip_end > 20 * 5000 for camera in cameras)
+    assert all(0.01 < camera.data.clip_start <= 0.1 + 1e-6 for camera in cameras)
+    blender_scene.scale_to_distance(root, (0, 0, 0), (5000, 0, 0), 0.001)
+    assert all(camera.data.clip_start < 1e-4 for camera in cameras)
+
+
 def test_pixel_aspect_and_missing_photos_are_reported(fresh, folder):
     content = json.loads((folder / "cameras.json").read_text())
     content["cameras"][3]["K"][1][1] *= 1.05
@@ -512,6 +556,13 @@ def test_orient_to_ground_places_points_below_cameras(root):
         assert all(camera.matrix_world.translation.z > 0.5 for camera in cameras_of(root))
         center = sum(corners, Vector()) / 3
         assert tuple((move @ center).xy) == pytest.approx(tuple(center.xy), abs=1e-5)
+    # Blender does not update what is excluded from the view layer.
+    bpy.context.view_layer.layer_collection.children[root.name].children[kinds.capture_of(root).name].exclude = True
+    parent.matrix_world = Matrix.Rotation(np.pi, 4, "X") @ before
+    bpy.context.view_layer.update()
+    turned = [parent.matrix_world @ before.inverted() @ corner for corner in corners]
+    blender_scene.orient_to_ground(root, *turned)
+    assert all(blender_scene.matrix_to_world(camera)[2, 3] > 0.5 for camera in cameras_of(root))
     with pytest.raises(InputError, match="one line"):
         blender_scene.orient_to_ground(root, (0, 0, 0), (1, 1, 1), (3, 3, 3))
 
