@@ -466,6 +466,18 @@ def test_moved_parts_and_parented_pivots_are_included(root):
 # Duplicates.
 
 
+def test_other_objects_stay_active_in_edit_mode(root):
+    """Where another one became active, it would stay in Edit Mode behind."""
+    own = bpy.data.objects.new("own", bpy.data.meshes.new("own"))
+    bpy.context.scene.collection.objects.link(own)
+    names = ("duplicate_object", "separate_splats", "add_crop_box")
+    assert all(getattr(bpy.ops.objectgs, name).poll() for name in names)
+    bpy.context.view_layer.objects.active = own
+    bpy.ops.object.mode_set(mode="EDIT")
+    assert not any(getattr(bpy.ops.objectgs, name).poll() for name in names)
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
 def test_duplicate_shares_data_and_is_stored(root, folder):
     activate(root, 1)
     item(root).hue = 0.25

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Picking of points by a click."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("bpy")
 
-from objectgs.objectgs_addon.picking.point_picker import nearest
+from objectgs.objectgs_addon.picking.point_picker import PointPicker, nearest
 
 SIZE = (200, 100)
 
@@ -29,6 +31,23 @@ def test_click_picks_nearest_point():
     assert nearest(points, perspective(), SIZE, np.array([100, 50]), 12) == 0
     assert nearest(points, perspective(), SIZE, np.array([121, 51]), 12) == 1
     assert nearest(points, perspective(), SIZE, np.array([160, 80]), 12) is None
+
+
+def test_click_is_in_one_of_four_views():
+    """In Quad View, each has its own view of the points."""
+
+    def region(x, y, matrix, kind="WINDOW"):
+        data = SimpleNamespace(perspective_matrix=matrix)
+        return SimpleNamespace(type=kind, x=x, y=y, width=SIZE[0], height=SIZE[1], data=data)
+
+    from_behind = perspective() @ np.diag([-1.0, 1, -1, 1])
+    regions = [region(0, 200, None, "HEADER"), region(0, 0, perspective()), region(200, 0, from_behind)]
+    picker = PointPicker.__new__(PointPicker)
+    picker.positions, picker.picked = np.array([[0.0, 0, -5], [0, 0, 5]]), []
+    context = SimpleNamespace(area=SimpleNamespace(regions=regions))
+    for x, y, expected in ((100, 50, (0, 0, -5)), (300, 50, (0, 0, 5)), (300, 150, None)):
+        found = picker.pick(context, SimpleNamespace(mouse_x=x, mouse_y=y))
+        assert found == (expected is not None) and (not found or picker.picked[-1] == expected)
 
 
 def test_front_point_occludes_point_behind():
