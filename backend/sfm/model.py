@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -174,6 +175,25 @@ def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
         replace_file(target, old)
     replace_file(part, target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def former_on_error(capture: Path) -> Iterator[None]:
+    """Put the present sparse/0 of a capture back, or remove a new one, if the body raises an exception."""
+    target = capture / SPARSE
+    former = target.with_name("former")
+    shutil.rmtree(former, ignore_errors=True)
+    if target.exists():
+        shutil.copytree(target, former)
+    try:
+        yield
+    except BaseException:
+        shutil.rmtree(target, ignore_errors=True)
+        if former.exists():
+            replace_file(former, target)
+        raise
+    finally:
+        shutil.rmtree(former, ignore_errors=True)
 
 
 def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Iterable[str]) -> Mapping[str, str]:

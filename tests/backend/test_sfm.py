@@ -23,7 +23,7 @@ from backend.sfm import agreement, check, database, pairs, stages, worker
 from backend.sfm.former_frame import Pose, similarity
 from backend.sfm.model import centers_of
 from backend.sfm.sources.photos import Photo
-from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, InputError
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.formats import photos_source
 
@@ -169,6 +169,24 @@ def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypa
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("is_first", [False, True])
+def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkeypatch, run_command, is_first):
+    out = shutil.copytree(made, tmp_path / "capture")
+    if is_first:
+        shutil.rmtree(out / "sparse")
+    before = {path: path.read_bytes() for path in (out / "sparse").rglob("*") if path.is_file()}
+    report = (out / "sfm" / "sfm.json").read_bytes()
+
+    def stopped(found, *_):
+        assert (out / "sparse" / "0").is_dir()
+        raise Cancelled("Stopped")
+
+    monkeypatch.setattr(sfm_command, "_densify", stopped)
+    assert run_command("sfm", photos, "--out", out).code == EXIT_CANCELLED
+    assert {path: path.read_bytes() for path in (out / "sparse").rglob("*") if path.is_file()} == before
+    assert (out / "sfm" / "sfm.json").read_bytes() == report
+
+
 def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command, no_dense_points):
     folder = shutil.copytree(photos / "images", tmp_path / "mixed")
     Image.fromarray(photo(ring()[0], seed=900)).save(folder / "zz other room.png")

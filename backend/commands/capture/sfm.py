@@ -206,30 +206,31 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     by_gps = meters_per_unit(model.centers_of(best.model), positions_in_meters(images, figures))
     _place(best.model, capture, by_gps)
     up = common_up(model.rotations_of(best.model), ups_in_cameras(images, figures))
-    model.write_model(best.model, capture)
-    on_objects = path.name.endswith(database.ON_OBJECTS)
-    weak |= _densify(best.model, capture, on_objects, reporter)
-    check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
-    posed = list(figures)
-    left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
-    report = {
-        "photos": len(names) + len(unreadable) + len(unwanted),
-        "registered": len(posed),
-        "points": best.model.num_points3D(),
-        "reprojection_error": round(check.mean_error(best.model), 4),
-        "mapper": best.mapper,
-        "cameras": best.model.num_cameras(),
-        "rigs": rigs_of(best.model),
-        "set": made_from.set,
-        "separate_sets": best.sets if len(best.sets) > 1 else [],
-        "size_by_gps": by_gps is not None,
-        "up": None if up is None else up.tolist(),
-        "figures": {name: own._asdict() for name, own in figures.items()},
-        "weak": weak,
-        "left_out": left_out,
-        "seconds": round(time.monotonic() - started, 1),
-    }
-    write_json(work / REPORT, report)
+    with model.former_on_error(capture):
+        model.write_model(best.model, capture)
+        on_objects = path.name.endswith(database.ON_OBJECTS)
+        weak |= _densify(best.model, capture, on_objects, reporter)
+        check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
+        posed = list(figures)
+        left_out = {**unreadable, **unwanted, **model.reasons(path, names, posed, wrong)}
+        report = {
+            "photos": len(names) + len(unreadable) + len(unwanted),
+            "registered": len(posed),
+            "points": best.model.num_points3D(),
+            "reprojection_error": round(check.mean_error(best.model), 4),
+            "mapper": best.mapper,
+            "cameras": best.model.num_cameras(),
+            "rigs": rigs_of(best.model),
+            "set": made_from.set,
+            "separate_sets": best.sets if len(best.sets) > 1 else [],
+            "size_by_gps": by_gps is not None,
+            "up": None if up is None else up.tolist(),
+            "figures": {name: own._asdict() for name, own in figures.items()},
+            "weak": weak,
+            "left_out": left_out,
+            "seconds": round(time.monotonic() - started, 1),
+        }
+        write_json(work / REPORT, report)
     _tell(report, capture, reporter)
 
 
