@@ -85,11 +85,13 @@ def evaluate(
             found_scores = view_ids.result()
             of_view = {key: found_scores[key] for key in of_view}
             if alone and zero_is_background and not zero_is_class:
-                shown = dict(alone(i))
                 # The model may lack objects that the masks show.
-                nothing = np.zeros(truth.shape, np.float32)
-                for object_id in sorted({*shown, *np.unique(truth[truth > 0]).tolist()}):
-                    of_objects_alone.add(object_id, shown.get(object_id, nothing), truth)
+                missing = set(np.unique(truth[truth > 0]).tolist())
+                for object_id, shown in alone(i):
+                    of_objects_alone.add(object_id, shown, truth)
+                    missing.discard(object_id)
+                for object_id in sorted(missing):
+                    of_objects_alone.add(object_id, np.zeros(truth.shape, np.float32), truth)
         views.append({"name": name, **of_image, **of_view})
         reporter.progress(
             done + 1, len(indices), psnr=of_image["psnr"], **of_view, zero_is_background=zero_is_background

@@ -90,7 +90,7 @@ class _All:
         for obj, own, slot in zip(objs, self._own, self._kept.first_slots):
             self._entries[own, 0] = _indices(obj.splats, starts)
             self._entries[own, 1] = slot
-        self._rows: np.ndarray | None = None
+        self._seen: np.ndarray | None = None
         self._order = np.zeros(0, np.int64)
 
     def holds(self, objs: Sequence[DrawnObject]) -> bool:
@@ -98,7 +98,9 @@ class _All:
 
     def update(self, objs: Sequence[DrawnObject], view: View) -> np.ndarray | None:
         rows = view.viewmat[2] @ np.array([obj.matrix for obj in objs])
-        moved = self._rows is None or not np.array_equal(rows, self._rows)
+        # What is before the near plane is left out.
+        seen = np.append(rows, [view.near, view.orthographic])
+        moved = self._seen is None or not np.array_equal(seen, self._seen)
         marked = self._kept.has_other_marks(objs)
         if marked:
             for obj, own, slot in zip(objs, self._own, self._kept.first_slots):
@@ -106,7 +108,7 @@ class _All:
         if not marked and not moved:
             return None
         if moved:
-            self._rows = rows
+            self._seen = seen
             for splats, row, own in zip(self._splats, rows.astype(np.float32), self._own):
                 np.matmul(splats.means, row[:3], out=self._depths[own])
                 self._depths[own] += row[3]

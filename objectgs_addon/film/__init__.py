@@ -3,6 +3,6 @@
 
 from .camera_path import make_path, new_camera
 from .compositing import has_frames, set_up_compositor, show_frames
-from .shot import shot_of
+from .shot import ignored_settings, shot_of
 
-__all__ = ["has_frames", "make_path", "new_camera", "set_up_compositor", "shot_of", "show_frames"]
+__all__ = ["has_frames", "ignored_settings", "make_path", "new_camera", "set_up_compositor", "shot_of", "show_frames"]

@@ -12,6 +12,7 @@ Blender 4.2 to 4.5 store the compositor nodes in the scene, 5.0 and newer in a n
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +114,8 @@ def _load(folder: Path, frames: list[int]) -> bpy.types.Image:
 
 
 def _path(image: bpy.types.Image) -> Path:
-    return Path(bpy.path.abspath(image.filepath)) if image is not None else Path()
+    # A relative path may lead upwards first.
+    return Path(os.path.normpath(bpy.path.abspath(image.filepath))) if image is not None else Path()
 
 
 def _use(tree: bpy.types.NodeTree, folder: Path, frames: list[int]) -> None:
@@ -184,7 +186,14 @@ def _rendering(
 ) -> Any:
     """Return the current input of the output, or else the view layer's rendering, and the view layer's depth."""
     view_layer.use_pass_z = True
-    layers = next((node for node in tree.nodes if node.type == "R_LAYERS" and node.layer == view_layer.name), None)
+    layers = next(
+        (
+            node
+            for node in tree.nodes
+            if node.type == "R_LAYERS" and node.scene == scene and node.layer == view_layer.name
+        ),
+        None,
+    )
     if layers is None:
         layers = graph.node("CompositorNodeRLayers", scene=scene, layer=view_layer.name)
         layers.location = (output.node.location.x - 2000.0, output.node.location.y)

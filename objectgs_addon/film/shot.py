@@ -9,6 +9,7 @@ Blender's rendering without the reconstruction. An object not moved in Blender k
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,6 +40,7 @@ def shot_of(
     frames: Sequence[int],
     samples: int = 1,
     progress: Callable[[int, int], object] = lambda *_: None,
+    camera: bpy.types.Object | None = None,
 ) -> Shot:
     """Sample the scene's frames as a shot of a reconstruction; the scene's current frame is restored.
 
@@ -49,6 +51,7 @@ def shot_of(
         frames: frame numbers, ascending.
         samples: sub-frames per frame while the shutter is open; 1 samples the frame itself.
         progress: called with (done, total) after every frame.
+        camera: the camera; None: the scene's at each frame, which markers may change.
 
     Returns:
         The shot.
@@ -69,21 +72,34 @@ def shot_of(
     try:
         with _evaluated_pivots(view_layer, instances):
             for done, number in enumerate(frames, 1):
-                taken = []
+                # A camera that a marker brings in during the exposure begins with the next frame, as in Blender.
+                scene.frame_set(number)
+                seen_by, taken = camera or scene.camera, []
                 for time in _times(scene, number, samples):
                     whole = math.floor(time)
                     scene.frame_set(whole, subframe=time - whole)
                     frame = _RootTransform.of(root, scale)
                     scale = frame.scale
-                    taken.append(_sample(scene, view_layer, instances, frame, time))
+                    taken.append(_sample(scene, view_layer, seen_by, instances, frame, time))
                 made.append(Frame(number, _shutter(scene, number, samples), taken))
                 progress(done, len(frames))
     finally:
         scene.frame_set(before[0], subframe=before[1])
-    _reset_unmoved([sample for frame in made for sample in frame.samples])
+    _reset_unmoved([sample for frame in made for sample in frame.samples], instances)
     width, height = _size(scene)
     aspect = scene.render.pixel_aspect_x / scene.render.pixel_aspect_y
     return Shot(width, height, made, pixel_aspect=aspect, depth_scale=scale, only_named=True)
+
+
+def ignored_settings(scene: bpy.types.Scene) -> str | None:
+    """Return a sentence about settings of Blender's renders that film frames do not have; None if there are none."""
+    camera, render = scene.camera, scene.render
+    found = []
+    if camera is not None and camera.type == "CAMERA" and camera.data.dof.use_dof:
+        found.append(f"the depth of field of {camera.name}")
+    if render.use_border and render.use_crop_to_border:
+        found.append("Crop to Render Region")
+    return f"Film frames of splats are rendered without {' and '.join(found)}." if found else None
 
 
 @dataclass(frozen=True)
@@ -178,14 +194,15 @@ class _SplatsInstance:
         return np.array(world, np.float64)
 
 
-def _reset_unmoved(samples: Sequence[Sample]) -> None:
-    """Remove the transforms of objects that are not moved in any sample."""
+def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstance]) -> None:
+    """Remove the transforms of objects that are not moved in any sample, and have no duplicates, even hidden ones."""
     here = np.eye(4)[None]
+    counts = Counter(instance.object_id for instance in instances)
     moving = {
         object_id
         for sample in samples
         for object_id, placed in sample.objects.items()
-        if not np.array_equal(placed.maps, here)
+        if counts[object_id] > 1 or not np.array_equal(placed.maps, here)
     }
     for sample in samples:
         for object_id in sample.objects.keys() - moving:
@@ -196,13 +213,18 @@ def _instances_of(
     scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection
 ) -> list[_SplatsInstance]:
     paths = _paths(view_layer, root)
-    parent = parent_of(root)
-    ours = [obj for obj in scene.objects if kind_of(obj) == SPLATS and _is_below(obj, parent)]
+    parent, members = parent_of(root), {root, *root.children_recursive}
+
+    def is_ours(obj: bpy.types.Object) -> bool:
+        # Others may be above an object that the user has parented to them.
+        return kind_of(obj) == SPLATS and (_is_below(obj, parent) or not members.isdisjoint(obj.users_collection))
+
+    ours = [obj for obj in scene.objects if is_ours(obj)]
     found = [instance for obj in ours if (instance := _instance_of(obj, paths)) is not None]
     for instancer in scene.objects:
         if instancer.instance_type == "COLLECTION" and instancer.instance_collection is not None:
             for obj in instancer.instance_collection.all_objects:
-                if kind_of(obj) == SPLATS and _is_below(obj, parent):
+                if is_ours(obj):
                     found.append(_instance_of(obj, paths, instancer))
     return [instance for instance in found if instance is not None]
 
@@ -287,7 +309,12 @@ def _evaluated_pivots(view_layer: bpy.types.ViewLayer, instances: Any) -> Iterat
 
 
 def _sample(
-    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, instances: Any, transform: _RootTransform, time: float
+    scene: bpy.types.Scene,
+    view_layer: bpy.types.ViewLayer,
+    camera: bpy.types.Object | None,
+    instances: Any,
+    transform: _RootTransform,
+    time: float,
 ) -> Sample:
     objects: dict[int, list[np.ndarray]] = {}
     for instance in instances:
@@ -295,7 +322,6 @@ def _sample(
             place = transform.map_from(instance.world(), center_of(instance.pivot))
             if not is_singular(place):
                 objects.setdefault(instance.object_id, []).append(place)
-    camera = scene.camera
     if camera is None or camera.type != "CAMERA":
         raise InputError(f"The scene {scene.name} has no camera at frame {time:g}; choose one.")
     if camera.data.type != "PERSP":

@@ -29,6 +29,7 @@ def film(options: argparse.Namespace) -> None:
         target.render.resolution_x, target.render.resolution_y = options.size
         target.render.resolution_percentage = 100
     choose_camera(target, options.camera, blend)
+    camera = target.camera if options.camera else None
     found = apart.reconstructions(target)
     if not found:
         raise InputError(f"{blend} has no reconstruction; make one with the build command, or append one to it.")
@@ -41,7 +42,11 @@ def film(options: argparse.Namespace) -> None:
     if not Reconstruction(folder).splats.is_file():
         raise InputError(f"The reconstruction folder {folder} has no splats.ply; name its present location with --dir.")
     frames = _frames(options, target)
-    shot = filming.shot_of(target, target.view_layers[0], root, frames, options.subframes or samples_of(target))
+    shot = filming.shot_of(
+        target, target.view_layers[0], root, frames, options.subframes or samples_of(target), camera=camera
+    )
+    if ignored := filming.ignored_settings(target):
+        reporter.warning(ignored)
     out.mkdir(parents=True, exist_ok=True)
     # Machines that share the folder require separate files.
     path = out / (f"shot.{frames[0]:04d}-{frames[-1]:04d}.json" if options.frames else NAME)
@@ -67,6 +72,8 @@ def film(options: argparse.Namespace) -> None:
         choose_engine(target, options.engine, options.samples, reporter)
         for number in frames:
             target.frame_set(number)
+            # Markers may bring in others.
+            target.camera = camera or target.camera
             path = out / f"composite.{number:04d}.{options.composite}"
             write_picture(target, path)
             reporter.status(f"Wrote {path}.")

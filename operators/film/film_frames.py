@@ -56,6 +56,8 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
             )
             folder.mkdir(parents=True, exist_ok=True)
             write_shot(folder / NAME, shot)
+            if ignored := film.ignored_settings(owner):
+                self.report({"WARNING"}, ignored)
         finally:
             manager.progress_end()
         options = ["--png"] if settings.png else []

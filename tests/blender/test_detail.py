@@ -3,6 +3,7 @@
 
 import gc
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -72,6 +73,14 @@ def test_small_scenes_draw_all_splats():
     depth = np.concatenate([obj.splats.means[:, 2] for obj in objs])[indices(table)] + 5.0
     assert (np.diff(depth) < 3e-4 * depth[1:]).all()
     assert np.array_equal(table[:, 1], indices(table) >= COUNT)
+
+
+def test_splats_before_the_near_plane_come_back_when_it_does():
+    objs = [drawn(splats())]
+    entries = entries_of(objs, {id(objs[0].splats): 0})
+    assert len(entries.update(objs, view(5.0))) == COUNT and entries.update(objs, view(5.0)) is None
+    some = entries.update(objs, replace(view(5.0), near=5.0))
+    assert 0 < len(some) < COUNT and len(entries.update(objs, view(5.0))) == COUNT
 
 
 def test_indices_are_exact_beyond_the_integers_of_float32():

@@ -222,6 +222,61 @@ def test_objects_hidden_in_renders_are_omitted(root):
     assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
 
 
+def test_objects_below_others_are_filmed(root):
+    scene = bpy.context.scene
+    own = bpy.data.objects.new("own", None)
+    scene.collection.objects.link(own)
+    pivot = ensure_pivot(root, 1)
+    bpy.context.view_layer.update()
+    world = pivot.matrix_world.copy()
+    pivot.parent = own
+    pivot.matrix_world = world
+    own.location.x = 2.0
+    bpy.context.view_layer.update()
+    shot = shoot(root)
+    assert_placed(root, shot, shot.frames[0].samples[0], 1, splats_of(root, 1))
+
+
+def test_duplicates_hidden_in_renders_are_not_filmed(root):
+    copy = blender_scene.duplicate(root, blender_scene.object_collections(root)[2])
+    bpy.context.view_layer.update()
+    kinds.part_of(copy, "object_parent").location.x += 1.0
+    bpy.context.view_layer.update()
+    assert len(shoot(root).frames[0].samples[0].objects[2].maps) == 2
+    # The copy is in objects.json, which counts for objects without maps.
+    copy.hide_render = True
+    (only,) = shoot(root).frames[0].samples[0].objects[2].maps
+    assert np.allclose(only, np.eye(4))
+
+
+def test_markers_change_cameras_between_frames(root):
+    """Not within the exposure of one, and not if a camera is given."""
+    scene = bpy.context.scene
+    first, second = scene.camera, scene.camera.copy()
+    second.data = scene.camera.data.copy()
+    second.location.x += 3
+    scene.collection.objects.link(second)
+    for frame, camera in ((1, first), (3, second)):
+        scene.timeline_markers.new(camera.name, frame=frame).camera = camera
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 1.0
+    bpy.context.view_layer.update()
+    found = shoot(root, (2, 3), 4)
+    of_first, of_second = ([sample.viewmat for sample in frame.samples] for frame in found.frames)
+    assert all(np.allclose(each, of_first[0]) for each in of_first)
+    assert all(np.allclose(each, of_second[0]) for each in of_second) and not np.allclose(of_first[0], of_second[0])
+    given = film.shot_of(scene, bpy.context.view_layer, root, [3], camera=first)
+    assert np.allclose(given.frames[0].samples[0].viewmat, of_first[0])
+
+
+def test_settings_that_films_ignore_are_named(root):
+    scene = bpy.context.scene
+    assert film.ignored_settings(scene) is None
+    scene.camera.data.dof.use_dof = True
+    assert "depth of field of Film" in film.ignored_settings(scene)
+    scene.render.use_border = scene.render.use_crop_to_border = True
+    assert "and Crop to Render Region" in film.ignored_settings(scene)
+
+
 def test_hidden_camera_follows_its_constraints(root):
     scene = bpy.context.scene
     dolly, aim = (bpy.data.objects.new(name, None) for name in ("dolly", "aim"))

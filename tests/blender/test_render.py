@@ -168,6 +168,9 @@ def test_exports_contain_the_texture(shown, tmp_path, shading):
 def test_problems_of_render_settings_are_named(shown):
     scene = bpy.context.scene
     assert "view transform AgX" in blender_scene.render_problem(scene, shown)
+    scene.camera.data.type = "ORTHO"
+    assert "is orthographic" in blender_scene.render_problem(scene, shown)
+    scene.camera.data.type = "PERSP"
     scene.view_settings.view_transform = "Standard"
     assert blender_scene.render_problem(scene, shown) is None
     scene.render.engine = "CYCLES"

@@ -13,7 +13,9 @@ from ...capture import Capture
 from ...evaluation import comparison, write_report
 from ...evaluation.mesh_sheet import MESHES_SHOWN, Card, mesh_sheet, summarize_figures, view_of
 from ...evaluation.meshes import digest, mesh_entries, read_texture
+from ...export import ExactSplats
 from ...model.draw import draw
+from ...model.object_model import ObjectModel
 from ...raster import devices
 from ...shared.errors import InputError
 from ...shared.events import Reporter
@@ -72,7 +74,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         curve=[entry for entry in progress.curve if "psnr" in entry],
         model={
             "anchors": len(model.anchors),
-            "gaussians": len(model.generate().source) if model.explicit else (export and export.splats),
+            "gaussians": export.splats if export else _count(model),
             "bytes": folder.splats.stat().st_size if folder.splats.exists() else None,
             "trained_steps": progress.step, "trained_seconds": round(progress.seconds, 1),
             "psnr_of_export": export.psnr_of_export if export else None,
@@ -190,6 +192,11 @@ def _objects(
         }
         for i in sorted(ids)
     ]  # fmt: skip
+
+
+def _count(model: ObjectModel) -> int | None:
+    """Return the number of splats of a model; None if it depends on the view."""
+    return sum(len(part.source) for part in ExactSplats(model).parts()) if model.explicit else None
 
 
 def _left_out(trained: Trained, evaluation: Evaluation) -> list[dict[str, str]]:

@@ -91,7 +91,7 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
                 use_active_scene=True,
             )
         elif suffix == "usdc":
-            bpy.ops.wm.usd_export(filepath=str(path), export_materials=True)
+            bpy.ops.wm.usd_export(filepath=str(path), export_materials=True, overwrite_textures=True)
         else:
             axes = {"forward_axis": "Y", "up_axis": "Z"} if in_capture else {}
             bpy.ops.wm.obj_export(filepath=str(path), path_mode="COPY", export_materials=True, **axes)

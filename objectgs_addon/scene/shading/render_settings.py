@@ -82,6 +82,8 @@ def render_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | 
         return None
     if scene.camera is None:
         return "The scene has no camera."
+    if scene.camera.type == "CAMERA" and scene.camera.data.type == "ORTHO":
+        return f"{scene.camera.name} is orthographic, for which splats are too narrow."
     transform = scene.view_settings.view_transform
     if transform != VIEW_TRANSFORM:
         return f"The view transform {transform} changes the colors of the photos."
