@@ -143,9 +143,14 @@ def _shortened(sentence: str) -> str:
 
 def _describe_error(error: Exception) -> str | None:
     """Return a sentence for errors due to missing memory, packages or files; None for all other errors."""
-    from ..raster.devices import is_out_of_memory
+    try:
+        from ..raster.devices import is_out_of_memory
 
-    if is_out_of_memory(error):
+        is_gpu_full = is_out_of_memory(error)
+    except (ImportError, OSError):
+        # The error may be that torch cannot be loaded.
+        is_gpu_full = False
+    if is_gpu_full:
         return (
             "The GPU's memory is full; close programs that use it, or try a smaller --max-size or --max-anchors, or "
             "--device cpu. The same command resumes from the last checkpoint."

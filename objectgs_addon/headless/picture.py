@@ -144,7 +144,8 @@ def _ended_by_signals(part: Path) -> Iterator[None]:
     Only the image in progress is lost; its file `part` is removed.
     """
     listen, ring = os.pipe()
-    os.set_blocking(ring, False)
+    if hasattr(os, "set_blocking"):  # Windows has it since Python 3.12.
+        os.set_blocking(ring, False)
 
     def wait() -> None:
         if os.read(listen, 1) in (bytes([signal.SIGINT]), bytes([signal.SIGTERM])):

@@ -8,7 +8,7 @@ from bpy.props import IntProperty
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon.environment import environment, locations, online_access
-from ...objectgs_addon.running import background
+from ...objectgs_addon.running import background, pointing
 from ..common.reporting import reports_errors
 
 
@@ -65,6 +65,8 @@ class SetUpBackend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         if locations.is_chosen_missing():
             raise InputError(f"{locations.backend_sentence()} It is Backend Python in the preferences of ObjectGS")
+        # Its process uses the present environment.
+        pointing.stop()
         preferences = locations.preferences()
         device = preferences.device if preferences else "cpu"
         job = environment.set_up_job(locations.base_python(), locations.environment_folder(), device)
@@ -119,13 +121,17 @@ class RemoveBackend(bpy.types.Operator):
         if environment.inspect(locations.environment_folder()).state == "absent":
             cls.poll_message_set("The backend is not set up")
             return False
-        return _idle(cls)
+        if any(not job.is_finished for job in background.queue.jobs):
+            cls.poll_message_set("Jobs are running or waiting; stop them first")
+            return False
+        return True
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         return context.window_manager.invoke_confirm(self, event)
 
     @reports_errors
     def execute(self, _context: bpy.types.Context) -> None:
+        pointing.stop()
         try:
             environment.remove(locations.environment_folder())
         except OSError as error:

@@ -854,6 +854,18 @@ def test_failed_lock_write_leaves_no_file(tmp_path, monkeypatch):
 # --- other errors ----------------------------------------------------------------------------------------------------
 
 
+def test_library_that_cannot_be_loaded_is_named(run_command, monkeypatch):
+    """As torch on Windows, whose error has no file, and which is imported again to describe it."""
+
+    def refuse(*_):
+        raise OSError(None, "The paging file is too small for this operation to complete")
+
+    monkeypatch.setattr("backend.commands.command_of", refuse)
+    monkeypatch.setattr("backend.raster.devices.is_out_of_memory", refuse)
+    result = run_command("doctor", "--json")
+    assert result.code == 1 and "paging file is too small" in result.messages("error")[0]
+
+
 def test_unexpected_error_returns_exit_code_1(write_capture, run_command, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("two\nlines")

@@ -127,9 +127,12 @@ def test_concurrent_edits_are_all_applied(tmp_path):
 
 
 @pytest.mark.skipif(lock.fcntl is None, reason="Windows has locks of another kind")
-def test_file_systems_without_locks_can_be_used(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, 45])
+def test_file_systems_without_locks_can_be_used(tmp_path, monkeypatch, number):
+    """45 is ENOTSUP of macOS."""
+
     def refuse(_descriptor, _operation):
-        raise OSError(errno.ENOLCK, "No locks available")
+        raise OSError(number, "No locks available")
 
     monkeypatch.setattr(lock.fcntl, "flock", refuse)
     with locked(tmp_path):

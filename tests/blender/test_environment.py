@@ -10,6 +10,7 @@ import sys
 import time
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from objectgs.objectgs_addon.environment import environment
@@ -493,11 +494,83 @@ def test_probe_rejects_other_programs(root, program):
         (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),
         (["ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE."], "A package is not the file"),
         (["Collecting x", "ERROR: Some new trouble."], "could not be installed: Some new trouble."),
+        (
+            [
+                "WARNING: Retrying (Retry(total=0)) after connection broken by 'SSLError(SSLCertVerificationError(1, "
+                "'[SSL: CERTIFICATE_VERIFY_FAILED] certificate verify failed: self-signed certificate in chain'))'",
+                "ERROR: No matching distribution found for numpy==2.4.6",
+            ],
+            "virus scanner",
+        ),
+        (
+            ["ERROR: Exception:", "Traceback (most recent call last):", "ProtocolError: Connection broken: 10053"],
+            "could not be reached",
+        ),
+        (
+            ["ERROR: Exception:", "Traceback (most recent call last):", "KeyError: 'wheel'"],
+            "could not be installed: KeyError: 'wheel'.",
+        ),
+        (
+            ["error: externally-managed-environment", "hint: See PEP 668 for the detailed specification."],
+            "virtual environment",
+        ),
         ([], "it said nothing"),
     ],
 )
 def test_pip_failures_are_explained(lines, sentence):
     assert sentence in pip.why_pip_failed(lines)
+
+
+def test_download_of_a_local_version_is_found(root):
+    """pip prints its address quoted, and writes a file that is not."""
+    shown = []
+    progress = SimpleNamespace(status=shown.append, at=shown.append)
+    installer = pip.Pip(Path(sys.executable), root, root, progress, lambda: False)
+    installer._downloaded = installer._file_size = 0.0
+    installer._installing = []
+    installer._line("Downloading https://example.org/whl/torch-2.13.0%2Bcu130-cp311-win_amd64.whl (2000.0 MB)")
+    (root / "unpack").mkdir()
+    with (root / "unpack" / "torch-2.13.0+cu130-cp311-win_amd64.whl").open("wb") as file:
+        file.truncate(500_000_000)
+    installer._tick(megabytes=500)
+    assert shown == ["Downloading torch (2000.0 MB)", pytest.approx(0.25 * 2 / 3)]
+
+
+def test_crash_is_named_by_its_first_line():
+    output = checks._DoctorOutput(SimpleNamespace())
+    for line in (
+        "Fatal Python error: Illegal instruction",
+        "Current thread 0x1:",
+        "Extension modules: numpy (total: 9)",
+    ):
+        output.take(line)
+    assert output.last_message == "Fatal Python error: Illegal instruction"
+
+
+def test_missing_runtime_of_windows_is_named(monkeypatch):
+    checks.check_runtime()
+    monkeypatch.setattr(checks.sys, "platform", "win32")
+    with pytest.raises(events.Refused, match=r"vcruntime140\.dll.*vc_redist"):
+        checks.check_runtime()
+
+
+def test_environment_in_use_is_kept(root, monkeypatch):
+    """Windows refuses to rename a folder with a loaded library."""
+    folder = root / "environment"
+    (folder / "venv").mkdir(parents=True)
+    for name in (layout.STAMP, layout.MARKER):
+        (folder / name).write_text("{}")
+    with monkeypatch.context() as patched:
+
+        def refuse(*_):
+            raise PermissionError(13, "Access is denied")
+
+        patched.setattr(setup.os, "replace", refuse)
+        with pytest.raises(events.Refused, match=r"in use.*Access is denied"), setup.claimed(folder):
+            pass
+    assert (folder / "venv").is_dir() and (folder / layout.MARKER).is_file()
+    with setup.claimed(folder):
+        assert sorted(path.name for path in folder.iterdir()) == [layout.STAMP]
 
 
 def test_requirements_are_pinned():

@@ -24,8 +24,9 @@ except ImportError:  # Windows
 NAME = ".lock"
 _PATIENCE = 0.5
 """Time in seconds to retry for, since `lock_holder` briefly acquires the lock to test whether it is free."""
-_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
-"""Errors of file systems without locks, as some networks have; nothing is excluded there."""
+_HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
+"""Errors if another process holds a lock; others are those of file systems without locks, as some networks have, where
+nothing is excluded."""
 _LOCKED_BYTE = 1 << 30
 """Offset of the byte that is locked on Windows; it is beyond the content, which therefore stays readable."""
 
@@ -115,7 +116,7 @@ def _try_lock(descriptor: int) -> bool:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
             os.lseek(descriptor, 0, os.SEEK_SET)
     except OSError as error:
-        return error.errno in _NO_LOCKS
+        return error.errno not in _HELD
     return True
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import importlib.metadata
 import json
 import platform
@@ -18,6 +19,7 @@ from . import layout
 from .events import Progress, Refused, emit, print_error
 from .programs import run
 
+_FATAL = ("Fatal Python error", "Windows fatal exception")
 KERNEL_SECONDS = 60.0
 """Typical time of the compilation of the backend's kernels."""
 
@@ -51,10 +53,25 @@ def check_space(folder: Path, device: str) -> None:
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     free, needed = shutil.disk_usage(existing).free / 1e9, layout.GIGABYTES[device]
     if free < needed:
+        advice = "use Remove Backend first, or make" if (folder / layout.VENV).exists() else "make"
         raise Refused(
-            f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; make "
+            f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; {advice} "
             "room and try again."
         )
+
+
+def check_runtime() -> None:
+    """Raise Refused if Windows lacks the libraries of Visual C++, without which PyTorch cannot be loaded."""
+    if sys.platform != "win32":
+        return
+    for name in ("vcruntime140.dll", "msvcp140.dll", "vcruntime140_1.dll"):
+        try:
+            ctypes.CDLL(name)
+        except OSError as error:
+            raise Refused(
+                f"Windows lacks {name}, which PyTorch needs; install the Visual C++ Redistributable, "
+                "https://aka.ms/vs/17/release/vc_redist.x64.exe, and try again."
+            ) from error
 
 
 def check_backend(python: Path, progress: Progress, stop: Callable[[], bool]) -> dict[str, Any]:
@@ -67,7 +84,8 @@ def check_backend(python: Path, progress: Progress, stop: Callable[[], bool]) ->
     output = _DoctorOutput(progress)
     code = run([str(python), "-m", "backend", "doctor", "--json"], stop, output.take, first=b"attached\n")
     if code != 0:
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        # On Windows, a crash has a code such as 0xC0000005.
+        how = f"signal {-code}" if code < 0 else f"exit code {code if code < 0xC0000000 else hex(code)}"
         raise Refused(
             f"The packages are installed, but the backend does not work with them ({how}): "
             f"{output.last_message.rstrip('.')}."
@@ -91,7 +109,9 @@ class _DoctorOutput:
             event = None
         if not isinstance(event, dict):
             print_error(line)
-            self.last_message = line
+            # The lines after that are those of a stack.
+            if not self.last_message.startswith(_FATAL):
+                self.last_message = line
             return
         kind, message = event.get("type"), str(event.get("message", ""))
         if kind == "status":

@@ -18,6 +18,7 @@ from pathlib import Path
 MARKER = "ready.json"
 STAMP = "objectgs-environment"
 VENV = "venv"
+OLD = "venv-old"
 TEMPORARY = "tmp"
 REMOVED = ".removed-"
 """Infix of the name of a folder that is being removed."""
@@ -85,13 +86,15 @@ def remove_own(folder: Path, seconds: float = 10.0) -> None:
     Raises:
         OSError: files are still in use after that time.
     """
-    deadline = time.monotonic() + seconds
+    deadline: float | None = None
     (folder / MARKER).unlink(missing_ok=True)
-    for name in (VENV, TEMPORARY):
+    for name in (VENV, OLD, TEMPORARY):
         while os.path.lexists(folder / name):
             try:
                 shutil.rmtree(long_path(folder / name))
             except OSError:
+                # From the first failure on, since the removal itself may take long.
+                deadline = deadline or time.monotonic() + seconds
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.2)

@@ -8,6 +8,7 @@ import os
 import platform
 import re
 import sys
+import urllib.parse
 from collections.abc import Callable
 from pathlib import Path
 
@@ -103,7 +104,8 @@ class Pip:
             self.progress.status(f"Resolving {re.split('[^A-Za-z0-9._-]', words[1])[0]}")
         elif line.lstrip().startswith(("Downloading ", "Using cached ")) and size and ".metadata" not in line:
             self._downloaded += self._file_size
-            self._file = next(word for word in words if word.endswith(".whl")).rsplit("/", 1)[-1]
+            address = next(word for word in words if word.endswith(".whl"))
+            self._file = urllib.parse.unquote(address.rsplit("/", 1)[-1])
             self._file_size = float(size[1]) * {"k": 1e-3, "M": 1, "G": 1e3}[size[2]]
             if words[0] == "Downloading":
                 self.progress.status(f"Downloading {self._file.split('-')[0]} ({size[1]} {size[2]}B)")
@@ -118,7 +120,8 @@ class Pip:
             self.progress.at((2 + fraction) / 3)
         elif self._file:
             received = max((path.stat().st_size for path in self._partial()), default=0) / 1e6
-            self.progress.at(min((self._downloaded + min(received, self._file_size)) / megabytes, 1.0) * 2 / 3)
+            total = max(megabytes, self._downloaded + self._file_size)
+            self.progress.at((self._downloaded + min(received, self._file_size)) / total * 2 / 3)
 
     def _partial(self) -> list[Path]:
         return [path for path in self.temporary.rglob(self._file) if path.is_file()]
@@ -136,9 +139,18 @@ def why_pip_failed(lines: list[str]) -> str:
     text = "\n".join(lines)
     lacking = re.search(r"No matching distribution found for (\S+)", text)
     unreached = re.search(r"Retrying \(|Could not fetch URL|connection error|Connection to \S+ timed out", text)
+    broken = re.search(
+        r"ReadTimeoutError|ConnectionResetError|ProtocolError|Connection broken|Max retries exceeded", text
+    )
     if "No space left on device" in text or "not enough space on the disk" in text:
         return "The disk is full; make room and try again."
-    if (lacking and unreached) or "ReadTimeoutError" in text or "ConnectionResetError" in text:
+    if "CERTIFICATE_VERIFY_FAILED" in text:
+        return (
+            "The certificate of Python's package index is not accepted, as happens where a virus scanner or a proxy "
+            "reads encrypted connections, or the clock is wrong; allow this connection there, or name the proxy's "
+            "certificate in pip's setting cert, and try again."
+        )
+    if (lacking and unreached) or broken or "incomplete-download" in text:
         return (
             "Python's package index could not be reached; check the network connection (or pip's proxy or "
             "mirror settings) and try again."
@@ -157,5 +169,13 @@ def why_pip_failed(lines: list[str]) -> str:
             f"{other[1] if other else 'A package'} is not the file that ObjectGS was tested with (its hash differs), "
             "so nothing was installed; try again or, if that does not help, check pip's mirror settings."
         )
-    errors = [line for line in lines if line.startswith("ERROR: ")] or lines or ["it said nothing"]
+    if "externally-managed-environment" in text:
+        return (
+            "The system manages the packages of this Python, so nothing was installed; choose a Python of a virtual "
+            "environment, or use Set Up Backend."
+        )
+    errors = [line for line in lines if line.startswith("ERROR: ")]
+    # A traceback follows, whose last line says what happened.
+    if not errors or errors[-1].startswith("ERROR: Exception:"):
+        errors = lines or ["it said nothing"]
     return f"The packages could not be installed: {errors[-1].replace('ERROR: ', '', 1).rstrip('.')}."

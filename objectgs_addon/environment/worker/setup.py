@@ -11,12 +11,20 @@ import os
 import platform
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 from . import layout
-from .checks import KERNEL_SECONDS, check_backend, check_can_make_environments, check_python, check_space
+from .checks import (
+    KERNEL_SECONDS,
+    check_backend,
+    check_can_make_environments,
+    check_python,
+    check_runtime,
+    check_space,
+)
 from .choice import check_system, choose
 from .events import Progress, Refused, Stopped, emit, print_error
 from .pip import Pip
@@ -26,6 +34,7 @@ MEGABYTES = {"cpu": 180, "cuda": 3000}
 """Size of the downloads in MB, for the progress; on most systems that of cpu includes torch."""
 
 _LOCKED_BYTE = 1 << 30
+_PATIENCE = 5.0
 _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
 
 
@@ -39,6 +48,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
     folder, device = options.folder.absolute(), options.device
     check_python()
     check_can_make_environments()
+    check_runtime()
     check_space(folder, device)
     check_system(options.requirements, device)
     progress = Progress(
@@ -67,7 +77,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
             pip.install(["--no-deps", *chosen.torch], megabytes=500)
         progress.begin("kernels", "Starting the backend")
         checked = check_backend(layout.environment_python(folder), progress, stop)
-        shutil.rmtree(pip.temporary)
+        shutil.rmtree(pip.temporary, ignore_errors=True)
         ready = {
             "python": platform.python_version(),
             "base": getattr(sys, "_base_executable", None) or sys.executable,
@@ -89,7 +99,16 @@ def _write_marker(folder: Path, ready: dict[str, Any], stop: Callable[[], bool])
         os.fsync(file.fileno())
     if stop():
         raise Stopped
-    part.replace(folder / layout.MARKER)
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            part.replace(folder / layout.MARKER)
+            return
+        except PermissionError:
+            # On Windows, virus scanners hold new files for a moment.
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
 
 
 @contextlib.contextmanager
@@ -109,9 +128,10 @@ def claimed(folder: Path) -> Iterator[None]:
         stamp = opened.enter_context((folder / layout.STAMP).open("a+", encoding="utf-8"))
         if not _lock(stamp):
             raise Refused(f"Another Blender is setting up the backend in {folder}; wait for it.")
+        _put_aside(folder)
         (folder / layout.MARKER).unlink(missing_ok=True)
         try:
-            for name in (layout.VENV, layout.TEMPORARY):
+            for name in (layout.OLD, layout.TEMPORARY):
                 if (folder / name).is_dir():
                     emit("status", message="Removing the previous environment")
                     shutil.rmtree(layout.long_path(folder / name))
@@ -122,8 +142,25 @@ def claimed(folder: Path) -> Iterator[None]:
         except BaseException:
             # Windows cannot remove open files.
             opened.close()
-            layout.remove_own(folder)
+            # What is still in use, is removed by the next setup; why this one failed is what the user has to know.
+            with contextlib.suppress(OSError):
+                layout.remove_own(folder)
             raise
+
+
+def _put_aside(folder: Path) -> None:
+    """Rename the earlier environment in `folder`; raise Refused, with nothing changed, if Windows says it is in use."""
+    if not (folder / layout.VENV).is_dir():
+        return
+    if (folder / layout.OLD).is_dir():
+        shutil.rmtree(layout.long_path(folder / layout.OLD))
+    try:
+        os.replace(layout.long_path(folder / layout.VENV), layout.long_path(folder / layout.OLD))  # noqa: PTH105
+    except OSError as error:
+        raise Refused(
+            f"The backend in {folder} is in use by a job of this or another Blender ({error.strerror}); wait for the "
+            "job, or stop it, and try again."
+        ) from error
 
 
 def _lock(file: IO[str]) -> bool:
