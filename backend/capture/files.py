@@ -34,6 +34,10 @@ PilImage.MAX_IMAGE_PIXELS = 200_000_000
 _OPENING_ERRORS = (OSError, ValueError, SyntaxError, EOFError, MemoryError, PilImage.DecompressionBombError)
 
 
+_SRGB = ("sRGB IEC61966-2.1", "sRGB built-in", "sRGB")
+"""Descriptions of usual profiles of sRGB, which need no conversion."""
+
+
 class Files:
     """The files below a folder, looked up by the names in a model.
 
@@ -130,11 +134,13 @@ def _without_alpha(image: PilImage.Image) -> PilImage.Image:
 def in_srgb(image: PilImage.Image) -> PilImage.Image:
     """Return an image in the colors of sRGB, if it has a profile of others, as photos of phones (Display P3)."""
     profile = image.info.get("icc_profile")
+    if profile and image.mode == "P":
+        image = image.convert("RGBA")
     if not profile or image.mode not in ("RGB", "RGBA", "RGBX", "L", "CMYK"):
         return image
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        if ImageCms.getProfileDescription(source).startswith("sRGB"):
+        if ImageCms.getProfileDescription(source).strip() in _SRGB:
             return image
         srgb = ImageCms.createProfile("sRGB")
         shown = ImageCms.profileToProfile(_without_alpha(image), source, srgb, outputMode="RGB")
@@ -348,10 +354,10 @@ def encode_mask(ids: np.ndarray) -> tuple[str, bytes]:
     return ".png", buffer.getvalue()
 
 
-def write_image(path: Path, image: PilImage.Image) -> None:
-    """Write a PNG atomically."""
+def write_image(path: Path, image: PilImage.Image, exif: PilImage.Exif | None = None) -> None:
+    """Write a PNG atomically, with EXIF data if there are any."""
     buffer = io.BytesIO()
-    image.save(buffer, "PNG", compress_level=1)
+    image.save(buffer, "PNG", compress_level=1, **({"exif": exif} if exif else {}))
     write_atomic(path, buffer.getvalue())
 
 

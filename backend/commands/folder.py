@@ -166,6 +166,20 @@ def require_reconstruction(folder: Reconstruction) -> None:
         )
 
 
+@contextmanager
+def locked_reconstruction(options: argparse.Namespace) -> Iterator[None]:
+    """Lock the reconstruction of a command, before it is read, so that nothing changes in between.
+
+    Raises:
+        InputError: as `require_reconstruction`.
+        FolderInUse: another process has locked it.
+    """
+    folder = Reconstruction(options.folder)
+    require_reconstruction(folder)
+    with locked(folder.folder):
+        yield
+
+
 def open_trained(
     options: argparse.Namespace, reporter: Reporter, checkpoint: Path | None = None, own: Path | None = None
 ) -> Trained:

@@ -13,6 +13,7 @@ import pycolmap
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import replace_file
+from ..shared.formats.photos_source import WORK
 from . import database
 from .agreement import Agreement, measure_agreement
 
@@ -180,20 +181,23 @@ def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
 @contextmanager
 def former_on_error(capture: Path) -> Iterator[None]:
     """Put the present sparse/0 of a capture back, or remove a new one, if the body raises an exception."""
-    target = capture / SPARSE
-    former = target.with_name("former")
+    # Not beside the model, where it would be another one of the capture.
+    target, former = capture / SPARSE, capture / WORK / "former"
     shutil.rmtree(former, ignore_errors=True)
     if target.exists():
         shutil.copytree(target, former)
     try:
         yield
     except BaseException:
-        shutil.rmtree(target, ignore_errors=True)
+        old = target.with_name("old")
+        shutil.rmtree(old, ignore_errors=True)
+        if target.exists():
+            replace_file(target, old)
         if former.exists():
             replace_file(former, target)
+        shutil.rmtree(old, ignore_errors=True)
         raise
-    finally:
-        shutil.rmtree(former, ignore_errors=True)
+    shutil.rmtree(former, ignore_errors=True)
 
 
 def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Iterable[str]) -> Mapping[str, str]:

@@ -138,7 +138,10 @@ def show(properties: Any, _context: bpy.types.Context = None) -> None:
 
 
 def _undrawn() -> set[bpy.types.Object]:
-    """Return the splats in scenes that do not draw them; scenes that share splats share their preview."""
+    """Return the splats in scenes that do not draw them.
+
+    Scenes that share splats share their preview, which then is also seen where they are drawn.
+    """
     scenes = [scene for scene in bpy.data.scenes if not _is_drawn(scene.objectgs)]
     return {part for scene in scenes for part in gather.carriers(scene)}
 

@@ -23,7 +23,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.objects import is_singular
 from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
 from ..scene.capture import origin_of
-from ..scene.kinds import MESH, OBJECT_PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
+from ..scene.kinds import MESH, OBJECT_PARENT, PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
 from ..scene.object_collection import center_of
 
 TOLERANCE = 2e-6
@@ -68,12 +68,14 @@ def shot_of(
         raise InputError("The first frame is below 0, but image sequences have no negative numbers; move the shot.")
     instances = _instances_of(scene, view_layer, root)
     before = scene.frame_current, scene.frame_subframe
+    has_markers = any(marker.camera is not None for marker in scene.timeline_markers)
     made, scale = [], None
     try:
         with _evaluated_pivots(view_layer, instances):
             for done, number in enumerate(frames, 1):
-                # A camera that a marker brings in during the exposure begins with the next frame, as in Blender.
-                scene.frame_set(number)
+                if camera is None and has_markers:
+                    # A camera that begins during the exposure begins with the next frame, as in Blender.
+                    scene.frame_set(number)
                 seen_by, taken = camera or scene.camera, []
                 for time in _times(scene, number, samples):
                     whole = math.floor(time)
@@ -91,12 +93,15 @@ def shot_of(
     return Shot(width, height, made, pixel_aspect=aspect, depth_scale=scale, only_named=True)
 
 
-def ignored_settings(scene: bpy.types.Scene) -> str | None:
-    """Return a sentence about settings of Blender's renders that film frames do not have; None if there are none."""
-    camera, render = scene.camera, scene.render
-    found = []
-    if camera is not None and camera.type == "CAMERA" and camera.data.dof.use_dof:
-        found.append(f"the depth of field of {camera.name}")
+def ignored_settings(scene: bpy.types.Scene, camera: bpy.types.Object | None = None) -> str | None:
+    """Return a sentence about settings of Blender's renders that film frames do not have; None if there are none.
+
+    camera: as for `shot_of`.
+    """
+    render = scene.render
+    cameras = [camera] if camera else [scene.camera, *(marker.camera for marker in scene.timeline_markers)]
+    blurred = {each.name for each in cameras if each is not None and each.type == "CAMERA" and each.data.dof.use_dof}
+    found = [f"the depth of field of {name}" for name in sorted(blurred)]
     if render.use_border and render.use_crop_to_border:
         found.append("Crop to Render Region")
     return f"Film frames of splats are rendered without {' and '.join(found)}." if found else None
@@ -216,8 +221,13 @@ def _instances_of(
     parent, members = parent_of(root), {root, *root.children_recursive}
 
     def is_ours(obj: bpy.types.Object) -> bool:
-        # Others may be above an object that the user has parented to them.
-        return kind_of(obj) == SPLATS and (_is_below(obj, parent) or not members.isdisjoint(obj.users_collection))
+        if kind_of(obj) != SPLATS:
+            return False
+        above = obj
+        while above is not None and kind_of(above) != PARENT:
+            above = above.parent
+        # An object that the user has parented to others has none of the parents.
+        return above == parent if above is not None else not members.isdisjoint(obj.users_collection)
 
     ours = [obj for obj in scene.objects if is_ours(obj)]
     found = [instance for obj in ours if (instance := _instance_of(obj, paths)) is not None]
@@ -260,12 +270,6 @@ def _paths(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict:
 
     walk(view_layer.layer_collection, [])
     return found
-
-
-def _is_below(obj: bpy.types.Object, parent: bpy.types.Object) -> bool:
-    while obj is not None and obj != parent:
-        obj = obj.parent
-    return obj is not None
 
 
 def _world_of(obj: bpy.types.Object) -> Matrix:

@@ -45,7 +45,8 @@ def film(options: argparse.Namespace) -> None:
     shot = filming.shot_of(
         target, target.view_layers[0], root, frames, options.subframes or samples_of(target), camera=camera
     )
-    if ignored := filming.ignored_settings(target):
+    target.camera = camera or target.camera
+    if ignored := filming.ignored_settings(target, camera):
         reporter.warning(ignored)
     out.mkdir(parents=True, exist_ok=True)
     # Machines that share the folder require separate files.

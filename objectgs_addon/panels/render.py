@@ -19,9 +19,9 @@ class RenderPanel(WithReconstruction, bpy.types.Panel):
         layout = self.layout
         owner = context.scene
         root = owner.objectgs.active
-        problem = scene.render_problem(owner, root)
-        if problem is not None:
-            write(layout, problem, "ERROR")
+        for problem in (scene.render_problem(owner, root), scene.camera_problem(owner, root)):
+            if problem is not None:
+                write(layout, problem, "ERROR")
         layout.operator("objectgs.set_up_render", icon="SCENE")
         column = layout.column(align=True)
         column.operator_context = "INVOKE_REGION_WIN"

@@ -140,8 +140,7 @@ def job_of(root: bpy.types.Collection) -> Job | None:
 
 def is_busy(root: bpy.types.Collection) -> bool:
     """Return whether the queue contains an unfinished job for a reconstruction, for panels."""
-    job = job_of(root)
-    return job is not None and not job.is_finished
+    return folder_trust.is_accepted(root) and busy(scene.folder_of(root))
 
 
 def failed_job(number: int) -> Job | None:

@@ -53,7 +53,7 @@ from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by, point_numbers, shown_points
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.materials import SHADINGS
-from .shading.render_settings import is_untouched, prepare_render, render_problem, set_up_render
+from .shading.render_settings import camera_problem, is_untouched, prepare_render, render_problem, set_up_render
 from .splats import splat_keys
 from .uncertain_cameras import uncertain_cameras
 
@@ -69,6 +69,7 @@ __all__ = [
     "add_crop_box",
     "bounds",
     "box_of",
+    "camera_problem",
     "capture_to_world",
     "collection_of",
     "color_points_by",

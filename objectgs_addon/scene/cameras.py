@@ -74,6 +74,8 @@ def widen_clipping(root: bpy.types.Collection, cameras: Sequence[bpy.types.Objec
     reach = float(np.linalg.norm(np.ptp(every, axis=0)) * max(map(abs, parent.matrix_world.to_scale())))
     for camera in [part for part in capture.objects if kind_of(part) == CAMERA] if cameras is None else cameras:
         data = camera.data
+        if data is None or data.library is not None:
+            continue
         data.clip_start = min(data.clip_start, reach * _NEAREST)
         data.clip_end = max(data.clip_end, reach * _FARTHEST)
 
@@ -88,20 +90,22 @@ def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
 
 def use_size(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:
     """Set the render size and pixel aspect to those of a capture camera's photo."""
-    aspect = float(camera["pixel_aspect"])
-    scene.render.resolution_x, scene.render.resolution_y = int(camera["width"]), int(camera["height"])
-    scene.render.resolution_percentage = 100
-    scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = max(aspect, 1.0), max(1.0 / aspect, 1.0)
+    for name, value in _size_of(camera).items():
+        setattr(scene.render, name, value)
 
 
 def has_size(scene: bpy.types.Scene, camera: bpy.types.Object) -> bool:
     """Return whether the scene has the render size and pixel aspect of a capture camera's photo."""
-    render, aspect = scene.render, float(camera["pixel_aspect"])
-    size = render.resolution_x, render.resolution_y, render.resolution_percentage
-    pixel = render.pixel_aspect_x, render.pixel_aspect_y
-    return size == (int(camera["width"]), int(camera["height"]), 100) and np.allclose(
-        pixel, (max(aspect, 1.0), max(1.0 / aspect, 1.0))
-    )
+    return all(np.isclose(getattr(scene.render, name), value) for name, value in _size_of(camera).items())
+
+
+def _size_of(camera: bpy.types.Object) -> dict[str, float]:
+    """Return the render settings with which a capture camera's render has the size of its photo."""
+    aspect = float(camera["pixel_aspect"])
+    return {
+        "resolution_x": int(camera["width"]), "resolution_y": int(camera["height"]), "resolution_percentage": 100,
+        "pixel_aspect_x": max(aspect, 1.0), "pixel_aspect_y": max(1.0 / aspect, 1.0),
+    }  # fmt: skip
 
 
 def _pose(view: CameraView, origin: np.ndarray) -> np.ndarray:

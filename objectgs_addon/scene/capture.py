@@ -93,7 +93,7 @@ def show_capture(
         capture = bpy.data.collections.new(f"{root.name} capture")
         mark(capture, CAPTURE)
         adopt(capture, root, (CAMERA, POINTS))
-    before = set(capture.objects)
+    before = {part.session_uid for part in capture.objects}
     shot = scene.camera if scene.camera is not None and kind_of(scene.camera) == CAMERA else None
     follows_photo = shot is not None and has_size(scene, shot)
     root[WARNINGS] = "\n".join(show_cameras(capture, parent, cameras))
@@ -106,7 +106,7 @@ def show_capture(
     if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
         scene.collection.children.link(root)
     ours = [obj for obj in capture.objects if kind_of(obj) == CAMERA]
-    widen_clipping(root, [camera for camera in ours if camera not in before])
+    widen_clipping(root, [camera for camera in ours if camera.session_uid not in before])
     if ours and scene.camera is None:
         use_camera(scene, min(ours, key=lambda obj: obj["objectgs_image"]))
     elif scene.camera in ours and follows_photo:

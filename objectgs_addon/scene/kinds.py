@@ -121,12 +121,17 @@ def adopt(
 
 
 def capture_of(root: bpy.types.Collection) -> bpy.types.Collection | None:
-    """Return the collection of the cameras and points, or None; also if the user has moved it elsewhere."""
+    """Return the collection of the cameras and points, also if the user has moved it out of `root`; None without it."""
     found = next((child for child in root.children_recursive if kind_of(child) == CAPTURE), None)
     if found is not None or (parent := parent_of(root)) is None:
         return found
-    others = (other for other in bpy.data.collections if kind_of(other) == CAPTURE)
-    return next((other for other in others if len(other.objects) and other.objects[0].parent == parent), None)
+    for scene in bpy.data.scenes:
+        for other in scene.collection.children_recursive:
+            if kind_of(other) == CAPTURE and any(
+                part.parent == parent and kind_of(part) in (CAMERA, POINTS) for part in other.objects
+            ):
+                return other
+    return None
 
 
 def points_of(root: bpy.types.Collection) -> bpy.types.Object | None:

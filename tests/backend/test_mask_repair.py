@@ -135,6 +135,21 @@ def test_splats_of_another_program_get_objects_by_later_masks(write_capture, tmp
     assert_rejected(run_command("clean-labels", alone), "has no capture with masks", "import the splats again")
 
 
+@pytest.mark.parametrize("words", [(), ("--max-size", 48)])
+def test_masks_of_distorted_and_reduced_photos_that_do_not_change_are_kept(
+    write_capture, tmp_path, run_command, words
+) -> None:
+    scene = write_capture(views=18, size=(96, 72), model="OPENCV", params=[90, 90, 48, 36, -0.2, 0.05, 0, 0])
+    out, given = tmp_path / "out", scene.folder / "masks"
+    before = {path.name: path.read_bytes() for path in given.iterdir()}
+    train = ("train", scene.folder, "--out", out, "--steps", 20, "--offsets", 4, *words)
+    assert run_command(*train).code == EXIT_DONE
+    assert run_command("clean-labels", out).code == EXIT_DONE
+    for index in load_capture(scene.folder, tmp_path / "cache").test_indices:
+        name = f"{scene.names[index][:-4]}.png"
+        assert (given / name).read_bytes() == before[name]
+
+
 def test_captures_without_masks_are_refused(write_capture, tmp_path, run_command) -> None:
     scene = write_capture(views=9, size=(64, 48), masks=False)
     out = tmp_path / "out"

@@ -750,7 +750,7 @@ def test_masks_have_no_object_where_no_splats_are(unlabeled) -> None:
     model.anchors = Anchors(
         anchors.layout, anchors.voxel, anchors.positions[keep], anchors.rows[keep], anchors.ids[keep]
     )
-    pointer = pointer_of(capture, model)
+    pointer = pointer_of(capture, model, None)
     ids = np.full(len(pointer.splats.means), 70_000)
     for (index, mask), (_, shown) in zip(
         pointer.masks(ids), pointer.shown_ids(ids, capture.train_indices), strict=True

@@ -168,7 +168,6 @@ def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypa
     assert (capture / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("is_first", [False, True])
 def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkeypatch, run_command, is_first):
     out = shutil.copytree(made, tmp_path / "capture")
@@ -187,6 +186,7 @@ def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkey
     assert (out / "sfm" / "sfm.json").read_bytes() == report
 
 
+@pytest.mark.long
 def test_photos_that_do_not_fit_are_named_with_the_reason(photos, tmp_path, run_command, no_dense_points):
     folder = shutil.copytree(photos / "images", tmp_path / "mixed")
     Image.fromarray(photo(ring()[0], seed=900)).save(folder / "zz other room.png")
@@ -501,8 +501,10 @@ def test_photos_to_leave_out_are_found_by_the_names_that_they_had():
             told.append(message)
 
     asked = ["a/1.HEIC", "b/\u00e9.jpg", "a/3.jpg"]
-    assert list(sfm_command._unwanted(asked, photos_there, Told())) == ["a/1.jpg", "b/e\u0301.jpg"]
-    assert len(told) == 1 and "a/3.jpg" in told[0] and "1.HEIC" not in told[0]
+    asked += ["", ".", "a/2.v2", "broken.jpg"]
+    found = sfm_command._unwanted(asked, photos_there, {"broken.jpg"}, Told())
+    assert list(found) == ["a/1.jpg", "b/e\u0301.jpg"]
+    assert len(told) == 1 and "a/3.jpg" in told[0] and "1.HEIC" not in told[0] and "broken" not in told[0]
 
 
 def test_cameras_are_others_if_photos_share_them_in_another_way():

@@ -452,19 +452,24 @@ def test_a_digital_zoom_is_another_camera(tmp_path):
     assert found[0] == found[2] != found[1]
 
 
-def test_raw_photos_of_another_size_or_lens_have_another_camera(tmp_path):
-    def raw(name, size, length):
+def test_raw_photos_of_another_size_or_lens_have_another_camera(tmp_path, monkeypatch):
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    sizes = {"a.nef": (60, 40), "b.nef": (60, 40), "c.nef": (40, 60), "d.nef": (60, 40), "e.cr3": (60, 40)}
+    for name in sizes:
         image, exif = Image.new("RGB", (16, 12)), Image.Exif()
-        exif.get_ifd(0x8769)[0x920A] = length
-        image.save(tmp_path / name, "TIFF", exif=exif)
-        Image.new("RGB", size).save(tmp_path / "developed.png")
-        return photo_files.camera_of_raw(tmp_path / name, tmp_path / "developed.png")
-
-    first = raw("a.nef", (60, 40), 50.0)
-    assert first.split(" ")[0] == "60x40" and first == raw("b.nef", (60, 40), 50.0)
-    assert len({first, raw("c.nef", (40, 60), 50.0), raw("d.nef", (60, 40), 35.0)}) == 3
-    (tmp_path / "e.cr3").write_bytes(b"unknown to Pillow")
-    assert photo_files.camera_of_raw(tmp_path / "e.cr3", tmp_path / "developed.png").startswith("60x40 .cr3")
+        exif[0x010F], exif.get_ifd(0x8769)[0x920A] = "Maker", 35.0 if name == "d.nef" else 50.0
+        image.save(folder / name, "TIFF", exif=exif)
+    (folder / "e.cr3").write_bytes(b"unknown to Pillow")
+    monkeypatch.setattr(photo_files, "_developed", lambda path: Image.new("RGB", sizes[path.name]))
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    cameras = {photo.name[0]: photo.camera for photo in taken.photos}
+    assert not taken.unreadable and [photo.size for photo in taken.photos[1:3]] == ["60x40", "40x60"]
+    assert cameras["a"] == cameras["b"] and len(set(cameras.values())) == 4
+    # The copies alone still tell the lenses apart.
+    shutil.rmtree(folder)
+    again = photos.take_photos([tmp_path / "capture" / "images"], tmp_path / "capture", None, reporter())
+    assert len({photo.camera for photo in again.photos}) == 4
 
 
 def test_raw_photos_need_their_package(tmp_path, monkeypatch):

@@ -169,8 +169,9 @@ def test_problems_of_render_settings_are_named(shown):
     scene = bpy.context.scene
     assert "view transform AgX" in blender_scene.render_problem(scene, shown)
     scene.camera.data.type = "ORTHO"
-    assert "is orthographic" in blender_scene.render_problem(scene, shown)
+    assert "is orthographic" in blender_scene.camera_problem(scene, shown)
     scene.camera.data.type = "PERSP"
+    assert blender_scene.camera_problem(scene, shown) is None
     scene.view_settings.view_transform = "Standard"
     assert blender_scene.render_problem(scene, shown) is None
     scene.render.engine = "CYCLES"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shutil
 import time
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,7 @@ _MATCH_LOFTR, _JOIN = 12.0, 0.02
 _ENOUGH = 0.95
 """Fraction of photos with trusted poses from which on the result of the first mapper is kept."""
 _WORST = 10
+_STOPPED = "Stopped; features and matches are kept. Run the same command again to continue."
 
 
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -123,7 +125,7 @@ def _require_own(source: Path, capture: Path) -> None:
 
 
 def _has_files(work: Path) -> bool:
-    """Return whether a folder sfm/, which is not one of a capture, has files of another program."""
+    """Return whether a folder sfm/ that this command has not made has files."""
     return work.exists() and (not work.is_dir() or any(path.name not in IGNORED for path in work.iterdir()))
 
 
@@ -144,7 +146,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         source = images
     else:
         source = made_from.photos[0] if len(made_from.photos) == 1 else made_from.photos[0].parent
-    unwanted = _unwanted(made_from.leave_out, photos, reporter)
+    unwanted = _unwanted(made_from.leave_out, photos, unreadable, reporter)
     photos = [photo for photo in photos if photo.name not in unwanted]
     names = [photo.name for photo in photos]
     count = len(photos)
@@ -234,21 +236,26 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     _tell(report, capture, reporter)
 
 
-def _unwanted(leave_out: Iterable[str], photos: list[Photo], reporter: Reporter) -> dict[str, str]:
+def _unwanted(
+    leave_out: Iterable[str], photos: list[Photo], unreadable: Collection[str], reporter: Reporter
+) -> dict[str, str]:
     """Return the photos that are left out, with the reason; warns of names that no photo has."""
-    names: dict[str, str] = {}
-    for photo in photos:
-        names.setdefault(unicodedata.normalize("NFC", Path(photo.name).with_suffix("").as_posix()), photo.name)
-    names |= {unicodedata.normalize("NFC", photo.name): photo.name for photo in photos}
+
+    def stem(name: str) -> str:
+        # Photos that were converted have another suffix.
+        path, suffix = os.path.splitext(name)  # noqa: PTH122 - names may have no stem
+        return path if suffix.lower() in PHOTOS else name
+
+    composed = {unicodedata.normalize("NFC", photo.name): photo.name for photo in photos}
+    names = {**{stem(name): photo for name, photo in reversed(composed.items())}, **composed}
     found, missing = {}, []
     for given in leave_out:
-        composed = unicodedata.normalize("NFC", given)
-        # Photos that were converted have another suffix.
-        name = names.get(composed) or names.get(Path(composed).with_suffix("").as_posix())
-        if name is None:
+        name = unicodedata.normalize("NFC", given)
+        photo = names.get(name) or names.get(stem(name))
+        if photo is not None:
+            found[photo] = "it was left out by request"
+        elif given not in unreadable:
             missing.append(given)
-        else:
-            found[name] = "it was left out by request"
     if missing:
         reporter.warning(f"No photo is named {', '.join(missing)}, so nothing was left out for that.")
     return found
@@ -309,6 +316,8 @@ def _densify(
         model.add_points(found, points.xyz, points.rgb)
         model.write_model(found, capture)
         contrasts = measure_contrasts(photos, range(len(photos.views)), reporter.check)
+    except Cancelled as error:
+        raise Cancelled(_STOPPED) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return {
@@ -326,7 +335,7 @@ class _StopsOnly(Reporter):
 
     def progress(self, *_: Any, **_fields: Any) -> None:
         if self._reporter.stop():
-            raise Cancelled("Stopped; features and matches are kept. Run the same command again to continue.")
+            raise Cancelled(_STOPPED)
 
 
 def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[dict[str, Any]]:

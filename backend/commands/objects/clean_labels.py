@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...capture import Capture, load_capture
+from ...capture.files import Files, is_three_channel, mask_names
 from ...capture.made_masks import (
     RECORD,
     REPAIRED,
@@ -25,12 +26,11 @@ from ...model.splats import Splats
 from ...pointing.mask_repair import Repair, repair_masks
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
-from ...shared.reconstruction.folder import STROKES, Reconstruction
-from ...shared.reconstruction.lock import locked
+from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.objects import default_name
 from ...shared.stopping import StoppingReporter
 from ..exported import EXPORT
-from ..folder import READ, Trained, memory_for_files, require_reconstruction
+from ..folder import READ, Trained, locked_reconstruction, memory_for_files
 from ..imported import write_labeled
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -56,9 +56,7 @@ def clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> Non
             EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    folder = Reconstruction(options.folder)
-    require_reconstruction(folder)
-    with locked(folder.folder):
+    with locked_reconstruction(options):
         _clean_labels(options, reporter)
 
 
@@ -165,20 +163,22 @@ def _write(
     # Masks that were repaired already are not given ones.
     is_given = before.is_dir() and not (before / REPAIRED).is_file() and not kept.exists()
     with new_masks(capture.folder, kept if is_given else None) as folder:
-        whole = capture.edited({}, ())
+        whole, files = capture.edited({}, ()), Files(before)
         for index, view in enumerate(capture.views):
             mask, file = masks.get(index), whole.uncorrected_mask(index)
             if mask is not None and file is not None:
                 # Objects that are left out of the training are still in the file.
                 mask = np.where((mask == 0) & np.isin(file, capture.left_out), file, mask)
-            path = whole.views[index].mask_file
-            if path is not None and (mask is None or file is None or np.array_equal(mask, file)):
-                # As it is, since the view may be smaller than the photo, or show less of it.
-                same = folder / path.relative_to(before)
+            given = files.first(mask_names(view.name)[0])
+            is_same = mask is None or (file is not None and np.array_equal(mask, file))
+            if given is not None and is_same and not is_three_channel(given):
+                # As it is, since the view may be smaller than the photo, or show less of it. Colors that are IDs are
+                # rewritten, since whether files are such is told from all of them.
+                same = folder / given.relative_to(before)
                 same.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path, same)
-            elif mask is not None:
-                write_mask(folder, view.name, capture.photo_mask(index, mask))
+                shutil.copyfile(given, same)
+            elif (ids := file if mask is None else mask) is not None:
+                write_mask(folder, view.name, capture.photo_mask(index, ids))
             reporter.progress(index + 1, len(capture), what="photos")
         for name in (STROKES, *([RECORD] if keeps_ids else [])):
             if (before / name).is_file():

@@ -19,8 +19,7 @@ from ...shared.events import Reporter
 from ...shared.formats.json_file import write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
-from ...shared.reconstruction.folder import STROKES, Reconstruction
-from ...shared.reconstruction.lock import locked
+from ...shared.reconstruction.folder import STROKES
 from ...shared.reconstruction.objects import default_name, forget_vanished
 from ...shared.reconstruction.plan import write_plan
 from ...shared.reconstruction.record import update_record
@@ -32,11 +31,11 @@ from ..exported import EXPORT, export_model
 from ..folder import (
     READ,
     Trained,
+    locked_reconstruction,
     memory_for_files,
     memory_for_targets,
     outdate_results,
     plan_of,
-    require_reconstruction,
 )
 from ..imported import write_labeled
 from ..planning import build_context, find_requested_objects
@@ -59,9 +58,7 @@ def label(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _MASKS: ("Making masks", 5.0), _TRAIN: ("Training", 25.0), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
-    folder = Reconstruction(options.folder)
-    require_reconstruction(folder)
-    with locked(folder.folder):
+    with locked_reconstruction(options):
         opened = open_pointable(options, reporter)
         source = require_splats(opened)
         if isinstance(source, Splats):

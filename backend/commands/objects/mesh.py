@@ -27,11 +27,10 @@ from ...shared.formats.atomic import write_atomic
 from ...shared.formats.file_names import hashed_stem
 from ...shared.formats.mesh_ply import Mesh, write_mesh
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.lock import locked
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, open_trained, require_reconstruction
+from ..folder import READ, Trained, locked_reconstruction, open_trained
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -65,10 +64,9 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             DISCS: ("Fitting discs", 30.0), "meshes": ("Meshing", 30.0),
         }
     )  # fmt: skip
-    folder = Reconstruction(options.folder)
-    require_reconstruction(folder)
-    with locked(folder.folder):
+    with locked_reconstruction(options):
         trained = open_trained(options, reporter)
+        folder = trained.folder
         ensure_kernels(reporter, trained.model.device)
         targets = _targets(options, folder)
         folder.meshes.mkdir(exist_ok=True)

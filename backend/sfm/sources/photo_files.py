@@ -7,6 +7,7 @@ import io
 import shutil
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pillow_heif
 from PIL import ExifTags, ImageOps
 from PIL import Image as PilImage
 
-from ...capture.files import image_size, in_srgb, read_image, write_image
+from ...capture.files import in_srgb, read_image, write_image
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.photos_source import RAW
@@ -25,6 +26,9 @@ COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 formats become PNG."""
 _COPIED_FORMATS, _HEIC_FORMATS = {"JPEG", "MPO", "PNG", "TIFF", "BMP"}, {"HEIF", "AVIF"}
 """Pillow's names of their formats, and of those of HEIC."""
+_MAKER = (ExifTags.Base.Make, ExifTags.Base.Model)
+_ZOOM = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
+"""EXIF entries of the lens; a digital zoom keeps the size and the focal length."""
 _QUALITY = 97
 """JPEG quality of photos that are converted or turned."""
 
@@ -32,7 +36,7 @@ pillow_heif.register_heif_opener()
 
 
 def camera_of(path: Path, turned: bool) -> str:
-    """Return what photos of one camera with one focal length have in common: size and, by EXIF, model and focal length.
+    """Return what photos of one camera with one focal length have in common: size and, by EXIF, model, lens and zoom.
 
     Args:
         path: the photo.
@@ -55,30 +59,24 @@ def camera_of(path: Path, turned: bool) -> str:
     return f"{size[0]}x{size[1]} {_lens_of(exif)}"
 
 
-def camera_of_raw(path: Path, developed: Path) -> str:
-    """Return the same of a raw photo, for the size of its developed copy, as far as Pillow reads its EXIF data.
-
-    Raises:
-        InputError: the copy cannot be read.
-    """
-    width, height = image_size(developed)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with PilImage.open(path) as image:
-                lens = _lens_of(image.getexif())
-    except Exception:
-        lens = ""
-    return f"{width}x{height} {path.suffix.lower()} {lens}"
+def _lens_data(path: Path) -> PilImage.Exif:
+    """Return the EXIF data of a raw photo that `camera_of` needs, as far as Pillow reads its format."""
+    kept = PilImage.Exif()
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PilImage.open(path) as image:
+            exif = image.getexif()
+            kept.update({tag: exif[tag] for tag in _MAKER if tag in exif})
+            details = exif.get_ifd(ExifTags.IFD.Exif)
+            kept.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in _ZOOM if tag in details})
+    return kept
 
 
 def _lens_of(exif: PilImage.Exif) -> str:
     """Return model, focal length and digital zoom by EXIF."""
     details = exif.get_ifd(ExifTags.IFD.Exif)
-    maker = [str(exif.get(tag, "")).strip("\0 ") for tag in (ExifTags.Base.Make, ExifTags.Base.Model)]
-    # A digital zoom keeps the size and the focal length of the lens.
-    zoom = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
-    return " ".join([*maker, *(str(details.get(tag, "")) for tag in zoom)])
+    maker = [str(exif.get(tag, "")).strip("\0 ") for tag in _MAKER]
+    return " ".join([*maker, *(str(details.get(tag, "")) for tag in _ZOOM)])
 
 
 def gps_position(path: Path) -> tuple[float, float, float] | None:
@@ -127,7 +125,7 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
         return target
     make_folder(target.parent)
     if suffix in RAW:
-        write_image(target, _developed(path))
+        write_image(target, _developed(path), _lens_data(path))
     elif is_heic:
         write_atomic(target, _as_jpeg(path, lambda image: image))
     elif not is_kept:

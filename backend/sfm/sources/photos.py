@@ -143,7 +143,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
                 copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
                 if is_raw:
-                    camera = photo_files.camera_of_raw(path, copied)
+                    camera = photo_files.camera_of(copied, False)
             photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
             names[name] = relative.as_posix()
         except InputError as error:
@@ -237,7 +237,10 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
     if entry and any(entry.get(key) != asked[key] for key in ("bytes", "modified")):
         # Frames of another video have the same names, whose features would be kept.
         database.remove_all(capture / WORK)
+        for name in entry.get("names", []):
+            (capture / IMAGES / folder / name).unlink(missing_ok=True)
         write_json(listed, {name: other for name, other in known.items() if name != folder})
+        entry = {}
     before = [capture / IMAGES / folder / name for name in entry.get("names", [])]
     if names is None or not all((capture / IMAGES / folder / name).is_file() for name in names):
         reporter.status(f"Choosing frames of {path.name}")

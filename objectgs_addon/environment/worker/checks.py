@@ -53,7 +53,7 @@ def check_space(folder: Path, device: str) -> None:
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     free, needed = shutil.disk_usage(existing).free / 1e9, layout.GIGABYTES[device]
     if free < needed:
-        advice = "use Remove Backend first, or make" if (folder / layout.VENV).exists() else "make"
+        advice = "use Remove Backend first, or make" if (folder / layout.MARKER).exists() else "make"
         raise Refused(
             f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; {advice} "
             "room and try again."

@@ -17,6 +17,11 @@ from .layout import TEMPORARY, VENV, environment_python
 from .programs import guarded, run
 
 PROBE_SECONDS = 8
+_BROKEN = (
+    "ReadTimeoutError", "ConnectionResetError", "ProtocolError", "Connection broken", "Max retries exceeded",
+    "incomplete-download",
+)  # fmt: skip
+"""What pip says where a connection ended during a download."""
 
 
 class Pip:
@@ -139,18 +144,18 @@ def why_pip_failed(lines: list[str]) -> str:
     text = "\n".join(lines)
     lacking = re.search(r"No matching distribution found for (\S+)", text)
     unreached = re.search(r"Retrying \(|Could not fetch URL|connection error|Connection to \S+ timed out", text)
-    broken = re.search(
-        r"ReadTimeoutError|ConnectionResetError|ProtocolError|Connection broken|Max retries exceeded", text
-    )
+    # Warnings may be about attempts that were repeated.
+    failure = text[text.find("ERROR: ") :] if "ERROR: " in text else text
+    broken = any(words in failure for words in _BROKEN)
     if "No space left on device" in text or "not enough space on the disk" in text:
         return "The disk is full; make room and try again."
-    if "CERTIFICATE_VERIFY_FAILED" in text:
+    if "CERTIFICATE_VERIFY_FAILED" in (text if lacking else failure):
         return (
             "The certificate of Python's package index is not accepted, as happens where a virus scanner or a proxy "
             "reads encrypted connections, or the clock is wrong; allow this connection there, or name the proxy's "
             "certificate in pip's setting cert, and try again."
         )
-    if (lacking and unreached) or broken or "incomplete-download" in text:
+    if (lacking and unreached) or broken:
         return (
             "Python's package index could not be reached; check the network connection (or pip's proxy or "
             "mirror settings) and try again."

@@ -34,7 +34,8 @@ MEGABYTES = {"cpu": 180, "cuda": 3000}
 """Size of the downloads in MB, for the progress; on most systems that of cpu includes torch."""
 
 _LOCKED_BYTE = 1 << 30
-_PATIENCE = 5.0
+_PATIENCE = 3.0
+"""Time in seconds for which a file that is in use is tried again."""
 _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend here; its preferences remove them.\n"
 
 
@@ -99,24 +100,15 @@ def _write_marker(folder: Path, ready: dict[str, Any], stop: Callable[[], bool])
         os.fsync(file.fileno())
     if stop():
         raise Stopped
-    deadline = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            part.replace(folder / layout.MARKER)
-            return
-        except PermissionError:
-            # On Windows, virus scanners hold new files for a moment.
-            if time.monotonic() > deadline:
-                raise
-            time.sleep(0.1)
+    _replace(part, folder / layout.MARKER)
 
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Lock `folder` for this process and remove an earlier environment; on any exception, remove the folder.
+    """Lock `folder` for this process and remove an earlier environment; on exceptions in the body, remove the folder.
 
     Raises:
-        Refused: the folder contains other files, or another process is using it.
+        Refused: the folder contains other files, or another process is using it; nothing is changed.
     """
     if not layout.is_ours(folder):
         raise Refused(f"{folder} is not empty and was not made by ObjectGS, so it is not used; move it away.")
@@ -142,7 +134,7 @@ def claimed(folder: Path) -> Iterator[None]:
         except BaseException:
             # Windows cannot remove open files.
             opened.close()
-            # What is still in use, is removed by the next setup; why this one failed is what the user has to know.
+            # The next setup removes what is still in use; why this one failed is what the user has to know.
             with contextlib.suppress(OSError):
                 layout.remove_own(folder)
             raise
@@ -155,12 +147,25 @@ def _put_aside(folder: Path) -> None:
     if (folder / layout.OLD).is_dir():
         shutil.rmtree(layout.long_path(folder / layout.OLD))
     try:
-        os.replace(layout.long_path(folder / layout.VENV), layout.long_path(folder / layout.OLD))  # noqa: PTH105
+        _replace(folder / layout.VENV, folder / layout.OLD)
     except OSError as error:
         raise Refused(
-            f"The backend in {folder} is in use by a job of this or another Blender ({error.strerror}); wait for the "
-            "job, or stop it, and try again."
+            f"The backend in {folder} is in use by a job or by Mark Objects in this or another Blender "
+            f"({error.strerror}); end it, and try again."
         ) from error
+
+
+def _replace(path: Path, target: Path) -> None:
+    """Rename a file or folder, on Windows as soon as virus scanners have released it."""
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            os.replace(layout.long_path(path), layout.long_path(target))  # noqa: PTH105
+            return
+        except PermissionError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.1)
 
 
 def _lock(file: IO[str]) -> bool:

@@ -82,8 +82,6 @@ def render_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | 
         return None
     if scene.camera is None:
         return "The scene has no camera."
-    if scene.camera.type == "CAMERA" and scene.camera.data.type == "ORTHO":
-        return f"{scene.camera.name} is orthographic, for which splats are too narrow."
     transform = scene.view_settings.view_transform
     if transform != VIEW_TRANSFORM:
         return f"The view transform {transform} changes the colors of the photos."
@@ -91,6 +89,14 @@ def render_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | 
         count = scene.cycles.transparent_max_bounces
         return f"Rays pass through at most {count} splats, which leaves black fringes."
     return None
+
+
+def camera_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | None:
+    """Return a sentence about a camera through which a reconstruction is rendered wrongly; None if there is none."""
+    camera = scene.camera
+    if root.hide_render or camera is None or camera.type != "CAMERA" or camera.data.type != "ORTHO":
+        return None
+    return f"{camera.name} is orthographic, for which splats are too narrow; set its Type to Perspective."
 
 
 def is_untouched(scene: bpy.types.Scene) -> bool:
