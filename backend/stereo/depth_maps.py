@@ -11,7 +11,6 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..capture import Capture, View
-from ..shared.stopping import Check
 from .patch_match import RADIUS, Others, match, match_planes, packed
 from .scene_planes import ScenePlane, find_planes
 
@@ -164,7 +163,7 @@ def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, withou
 
 
 def _with_planes(
-    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap], check: Check
+    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap], check: Callable[[], None]
 ) -> dict[int, DepthMap]:
     """Return depth maps with more depths, on the large planes of the scene; check: called for each."""
     if not maps:
