@@ -65,7 +65,7 @@ def rendered(path) -> np.ndarray:
     """Render with Cycles; return sRGB colors (H, W, 3)."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
-    scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 8, False
+    scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", 64, False
     scene.render.image_settings.file_format, scene.render.filepath = "PNG", str(path)
     bpy.ops.render.render(write_still=True)
     image = bpy.data.images.load(str(path))
