@@ -359,6 +359,7 @@ def test_command_goes_on_and_poses_are_right(networks, tmp_path, run_command, mo
         image.save(tmp_path / "photos" / name, quality=95, exif=exif)
     path = tmp_path / "capture" / "sfm" / f"learned-{checkpoint.fingerprint(networks)}-database.db"
     path.parent.mkdir(parents=True)
+    (path.parent / "source.json").write_text("{}")
     model = lightglue.LightGlue(networks)
     lightglue.find_features(path, tmp_path / "photos", [names[:3]], None, model.detect)
     lightglue.match_pairs(path, [(names[0], names[1])], model.match, worker.verification())

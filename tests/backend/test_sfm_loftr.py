@@ -362,6 +362,7 @@ def prepare(capture, network, photos, stand_in, left=()):
     """Write a capture's matched places, of all pairs but those left; return their file and the database."""
     work, digest = capture / "sfm", checkpoint.fingerprint(network)
     work.mkdir(parents=True)
+    (work / "source.json").write_text("{}")
     matched = work / positions.name_of(digest)
     match_all(matched, photos, stand_in, [pair for pair in combinations(photos[1], 2) if pair not in left])
     return matched, work / database.name_of(False, digest)
