@@ -20,6 +20,7 @@ from .events import Progress, Refused, emit, print_error
 from .programs import run
 
 _FATAL = ("Fatal Python error", "Windows fatal exception")
+"""First words of what Python prints when it crashes."""
 KERNEL_SECONDS = 60.0
 """Typical time of the compilation of the backend's kernels."""
 

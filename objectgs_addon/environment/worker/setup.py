@@ -144,8 +144,7 @@ def _put_aside(folder: Path) -> None:
     """Rename the earlier environment in `folder`; raise Refused, with nothing changed, if Windows says it is in use."""
     if not (folder / layout.VENV).is_dir():
         return
-    if (folder / layout.OLD).is_dir():
-        shutil.rmtree(layout.long_path(folder / layout.OLD))
+    shutil.rmtree(layout.long_path(folder / layout.OLD), ignore_errors=True)
     try:
         _replace(folder / layout.VENV, folder / layout.OLD)
     except OSError as error:
