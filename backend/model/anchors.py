@@ -43,6 +43,10 @@ class Layout:
         return slice(3 * self.offsets, 3 * self.offsets + 6)
 
     @property
+    def scale_columns(self) -> slice:
+        return slice(3 * self.offsets + 3, 3 * self.offsets + 6)
+
+    @property
     def feature_columns(self) -> slice:
         start = 3 * self.offsets + 6
         return slice(start, start + self.features)

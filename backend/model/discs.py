@@ -35,7 +35,7 @@ def to_discs(model: ObjectModel) -> ObjectModel:
         raise ValueError("only explicit models of 3D Gaussians can be converted to discs")
     anchors, layout = model.anchors, model.anchors.layout
     rows = anchors.rows.detach().clone()
-    count, scale_columns = len(rows), slice(layout.extent_columns.start + 3, layout.extent_columns.stop)
+    count, scale_columns = len(rows), layout.scale_columns
     with torch.no_grad():
         _, of_heads, _ = model.heads(rows[:, layout.feature_columns])
         shape = (of_heads + rows[:, layout.shape_columns]).view(count, layout.offsets, 7)

@@ -179,8 +179,8 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         for p in range(4):
             side = px if p < 2 else py
             distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
-            # The low-pass filter, or a disc's minimum footprint, adds up to 2.4 pixels at the border.
-            margin = 2.4 * max(pz, near) / min(fx, fy)
+            # The low-pass filter, or a disc's minimum footprint, adds up to 1.5 pixels at the border.
+            margin = 1.5 * max(pz, near) / min(fx, fy)
             inside = inside and distance > -reach - margin
         seen[a] = inside
 

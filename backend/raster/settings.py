@@ -22,8 +22,11 @@ __all__ = [
     "TRANSMITTANCE_THRESHOLD",
 ]
 
-EPS_2D_DISC = 0.5
+EPS_2D_DISC = 0.2
 """Variance in square pixels of the smallest footprint (spot) of a disc (low-pass filter of 2D Gaussian splatting)."""
+
+BLUR = {"3d": EPS_2D, "2d": EPS_2D_DISC}
+"""Variance in square pixels of the low-pass filter by primitive."""
 
 MIN_DISC_WIDTH = 0.05
 """Projected standard deviation in pixels below which only the spot of a disc is drawn, since such a thin line covers

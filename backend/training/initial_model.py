@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
 
-from ..model.anchors import cell_keys, median_spacing, seed_anchors, with_surroundings
+from ..model.anchors import Anchors, cell_keys, median_spacing, seed_anchors, with_surroundings
 from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..shared.class_table import ClassTable
@@ -90,6 +91,7 @@ def initial_model(
     anchors = seed_anchors(
         normalization.to_scene(xyz), rgb / 255.0, classes.classes_of(ids), voxel, settings.layout, rng
     )
+    _widen(anchors, pixel_size(capture) * normalization.scale)
     if surroundings is not None:
         anchors = with_surroundings(
             anchors, normalization.to_scene(surroundings.xyz), surroundings.rgb / 255.0, int(classes.classes_of(0)),
@@ -101,6 +103,16 @@ def initial_model(
     shade = {"learned": rgb.mean(axis=0) / 255.0, "black": np.zeros(3), "white": np.ones(3)}
     background = torch.from_numpy(shade[settings.background].astype(np.float32))
     return ObjectModel(anchors, heads, background, classes, normalization, settings.primitive)
+
+
+def _widen(anchors: Anchors, pixel: float) -> None:
+    """Add (pixel / 2)^2 to the variance of the splats, half as wide as the extents of their scales, if it is known.
+
+    Splats narrower than a pixel would leave gaps at first, through which the surface is learned too late or not at all.
+    """
+    if math.isfinite(pixel):
+        extents = anchors.rows[:, anchors.layout.scale_columns]
+        extents.copy_(torch.logaddexp(2.0 * extents, torch.tensor(2.0 * math.log(pixel))) / 2.0)
 
 
 def _occupied(xyz: np.ndarray, voxel: float) -> int:

@@ -17,6 +17,7 @@ from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..model.splats import gathered_columns
 from ..raster import devices
+from ..raster.settings import BLUR
 from ..shared.class_table import ClassTable
 from ..shared.errors import InputError
 from ..shared.formats.typed import typed
@@ -38,6 +39,14 @@ _BLOCK = 65536
 
 Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
+
+BLUR_KEY = "blur"
+"""Name of the low-pass filter's variance in a checkpoint's state; versions that did not write it used another one."""
+
+_OTHER_BLUR = (
+    "The model in {folder} was trained by a version that blurred splats more, so they appear too thin now; train it "
+    "further, or again, to adapt them."
+)
 
 _FORMER_TENSORS = {"adam.first": "adam.exp_avg", "adam.second": "adam.exp_avg_sq"}
 _FORMER_KEYS = {"teach_unlabelled": "supervise_background", "centre": "center", "settled_from": "converged_at"}
@@ -113,6 +122,7 @@ def training_state(
         "supervise_background": supervise_background,
         "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
         "rng": rng.bit_generator.state,
+        BLUR_KEY: BLUR[model.primitive],
         "progress": {**p.__dict__},
         **({} if region.is_whole else {"region": region.as_dict()}),
     }
@@ -230,6 +240,8 @@ def load_model(
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
     tensors, state, warning = read_result(folder, keep)
+    if warning is None and state.get(BLUR_KEY) != BLUR[Settings(**state["settings"]).primitive]:
+        warning = _OTHER_BLUR.format(folder=folder)
     return model_from_checkpoint(tensors, state).to(device), state, warning
 
 

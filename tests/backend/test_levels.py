@@ -265,7 +265,7 @@ def test_fewer_pixels_of_error_are_a_better_image(built):
         counts.append(len(places) / COUNT)
         errors.append(np.sqrt(((image(at(splats, levels, places), view) - whole) ** 2).mean()))
     assert counts[1] < 0.3 and counts == sorted(counts, reverse=True)
-    assert errors[1] < 0.03 and errors == sorted(errors)
+    assert errors[1] < 0.035 and errors == sorted(errors)
 
 
 def test_marked_splats_are_drawn_one_by_one(built):

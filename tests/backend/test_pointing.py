@@ -209,7 +209,7 @@ def test_rough_walker_solves_the_equations_of_clusters(monkeypatch) -> None:
 @pytest.fixture
 def unlabeled(write_capture, tmp_path, run_command):
     """A capture of three spheres that was trained without masks, and the scene."""
-    scene = write_capture(views=12, size=(96, 72))
+    scene = write_capture(views=12, size=(96, 72), points=80)
     shutil.move(scene.folder / "masks", tmp_path / "truth")
     (scene.folder / "labels.json").unlink()
     out = tmp_path / "out"
@@ -733,7 +733,7 @@ def test_masks_of_strokes_separate_better_than_strokes(unlabeled) -> None:
         found = dict(pointer.masks(pointer.solve(strokes)))
         agrees = [(mask == scene.ids[index])[scene.ids[index] > 0] for index, mask in found.items()]
         right.append(np.concatenate(agrees).mean())
-    assert right[1] > right[0] + 0.05 and right[1] > 0.9, right
+    assert 1 - right[1] < 0.5 * (1 - right[0]) and right[1] > 0.9, right
     photo = np.asarray(Image.open(scene.folder / "images" / scene.names[1]))
     assert np.array_equal(stand_in.pictures[scene.names[1]], photo)
     _, points, labels = stand_in.prompts[0]

@@ -137,7 +137,8 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
 PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
 
 
-@pytest.mark.parametrize("seed", range(4))
+# In scene 3, a pixel has a splat of exactly the least alpha that is drawn, so that rounding decides.
+@pytest.mark.parametrize("seed", [0, 1, 2, 4])
 @pytest.mark.parametrize(
     ("primitive", "coefficients"), [("3d", 1), ("3d", 4), ("3d", 9), ("3d", 16), ("2d", 1), ("2d", 4)]
 )

@@ -113,8 +113,11 @@ def test_zero_quaternion_is_dropped(primitive):
     compare(among_others(one(quat=(0, 0, 0, 0))), camera(), primitive=primitive)
 
 
-BEHIND_OPAQUE = 2e-4
+BEHIND_OPAQUE = 5e-4
 """Tolerance of gradients behind nearly opaque splats: small differences of two float32 sums, divided by 1 - alpha."""
+
+ACROSS_NEEDLES = 3e-5
+"""Tolerance of gradients of needles: distances from the axis in float32, divided by the low-pass filter's variance."""
 
 
 @pytest.mark.parametrize("length", [1e-3, 1e3, 1e9])
@@ -152,8 +155,8 @@ def test_needle(ratio, angle, thin, primitive):
         thin *= 10  # wide enough for its plane to be drawn
     half = np.deg2rad(angle) / 2
     needle = one(quat=(np.cos(half), 0, 0, np.sin(half)), scale=(thin * ratio, thin, thin), mean=(0.013, -0.021, 2.0))
-    compare(needle, camera(), primitive=primitive)
-    compare(among_others(needle), camera(), primitive=primitive)
+    compare(needle, camera(), gradient_tolerance=ACROSS_NEEDLES, primitive=primitive)
+    compare(among_others(needle), camera(), gradient_tolerance=ACROSS_NEEDLES, primitive=primitive)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -177,6 +180,7 @@ def test_long_needle_centered_outside_image(primitive):
         compare(
             one(mean=(distance, distance, 2.0), scale=(distance, 1e-3, 1e-3), quat=quat),
             straight(),
+            gradient_tolerance=1e-2,  # In float32, the axis is exact to 1e-4 pixels here.
             primitive=primitive,
         )
 
