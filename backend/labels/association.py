@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 
-from .regions import merge_regions
+from .regions import MANY, merge_regions, mutual_matches
 
 LEAST = 0.15
 """Smallest ratio of common points with which segments are one object; a mask that shows half of an object has 0.5,
@@ -28,6 +28,9 @@ get the object that most of this many nearest points belong to."""
 
 _BORDER = 0.01
 """Distance from a segment's border within which points may be beyond it, relative to the photo's longer side."""
+
+_PAIRS = 1 << 17
+"""Number of pairs of segments that are compared at a time."""
 
 _NONE = np.zeros(0, np.int64)
 
@@ -84,7 +87,8 @@ def associate(seen: Sequence[Seen], points: int) -> Association:
     together = (members @ members.T).tocsr()
     together.setdiag(0)
     together.eliminate_zeros()
-    cluster = merge_regions(together, _in_either(members, visible, together, of_photo, first), LEAST)
+    own = sparse.coo_array((np.ones(len(of_photo)), (np.arange(len(of_photo)), of_photo)), shape=(shape[0], len(seen)))
+    cluster = _merged(together, (members @ visible.T).tocsr(), own.tocsr())
     return _settled(seen, members, cluster, of_photo, first)
 
 
@@ -106,26 +110,58 @@ def consistency(ids: Sequence[np.ndarray], seen: Sequence[Seen]) -> float:
     return float(most[several].sum() / total[several].sum()) if several.any() else 1.0
 
 
-def _in_either(
-    members: sparse.csr_array,
-    visible: sparse.csr_array,
-    together: sparse.csr_array,
-    of_photo: np.ndarray,
-    first: np.ndarray,
-) -> sparse.csr_array:
-    """Return the number of points, of those that both photos of two segments show, that are in either: (S, S)."""
-    shared = (members @ visible.T).tocoo()
-    counts = np.diff(first)[shared.col]
-    rows = np.repeat(shared.row, counts)
-    within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-    columns = np.repeat(first[shared.col], counts) + within
-    values = np.repeat(shared.data, counts)
-    shape = (len(of_photo),) * 2
-    one_way = sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
-    either = (one_way + one_way.T - together).tocsr()
-    either.setdiag(0)
-    either.eliminate_zeros()
-    return either
+def _merged(together: sparse.csr_array, inside: sparse.csr_array, own: sparse.csr_array) -> np.ndarray:
+    """Merge segments whose points are mostly the same, of those that the photos of both show.
+
+    For two segments, or sets of segments, with `inside` a and b, and `own` p and q, these are a q + b p points, where
+    those in both count twice. For all pairs of segments, the numbers would not fit into memory.
+
+    Args:
+        together: (S, S), the points that two segments share.
+        inside: (S, V), how many points of each segment each photo shows.
+        own: (S, V), 1 for the photo of each segment.
+
+    Returns:
+        (S,) the merged segment of each segment, from 0.
+    """
+    cluster = np.arange(len(own.indptr) - 1)
+    while True:
+        count = together.shape[0]
+        pairs = sparse.triu(together, 1).tocoo()
+        either = _in_either(inside, own, pairs.row, pairs.col) - pairs.data
+        both = sparse.coo_array((either + 1j * pairs.data, (pairs.row, pairs.col)), shape=(count, count)).tocsr()
+        first, second, _ = mutual_matches(both, LEAST)
+        if len(first) < max(MANY * count, 1):
+            break
+        into = np.arange(count)
+        into[second] = first
+        kept, merged = np.unique(into, return_inverse=True)
+        contract = sparse.coo_array((np.ones(count), (merged, np.arange(count))), shape=(len(kept), count)).tocsr()
+        together = (contract @ together @ contract.T).tocsr()
+        together.setdiag(0)
+        together.eliminate_zeros()
+        inside, own, cluster = contract @ inside, contract @ own, merged[cluster]
+    # What merged segments have in common is a mean over their parts, so that the others are never merged.
+    good = both.tocoo()
+    left = np.unique(np.stack([good.row, good.col])[:, good.data.imag >= LEAST * good.data.real])
+    together, inside, own = together[left][:, left], inside[left], own[left]
+    total = (inside @ own.T).tocsr()
+    total = (total + total.T - together).tocsr()
+    total.setdiag(0)
+    total.eliminate_zeros()
+    merged = np.arange(count)
+    merged[left] = count + merge_regions(together, total, LEAST)
+    return np.unique(merged[cluster], return_inverse=True)[1]
+
+
+def _in_either(inside: sparse.csr_array, own: sparse.csr_array, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the points (n,) in either of the sets of segments `first` and `second` (n,); see `_merged`."""
+    found = np.zeros(len(first))
+    for begin in range(0, len(first), _PAIRS):
+        one, other = first[begin : begin + _PAIRS], second[begin : begin + _PAIRS]
+        there = inside[one].multiply(own[other]) + inside[other].multiply(own[one])
+        found[begin : begin + _PAIRS] = np.asarray(there.sum(1)).ravel()
+    return found
 
 
 def _settled(
@@ -181,21 +217,23 @@ def object_mask(segments: np.ndarray, photo: Seen, objects: np.ndarray, points: 
         (h, w) int64, the object of each pixel, 0 for none.
     """
     mask = objects[segments]
-    of_points = points[photo.points]
+    of_points, boxes = points[photo.points], ndimage.find_objects(segments)
     for segment in range(1, photo.segment_count + 1):
         inside = np.flatnonzero((photo.segments == segment) & (of_points > 0) & photo.is_certain)
         if len(np.unique(of_points[inside])) < 2:
             continue
-        shown = np.pad(segments == segment, 1)
+        box = boxes[segment - 1]
+        shown = np.pad(segments[box] == segment, 1)
         from_border = ndimage.distance_transform_edt(shown)[1:-1, 1:-1]
         x, y = photo.xy[inside].T
-        inside = inside[from_border[y, x] > _BORDER * max(segments.shape)]
+        inside = inside[from_border[y - box[0].start, x - box[1].start] > _BORDER * max(segments.shape)]
         found, counts = np.unique(of_points[inside], return_counts=True)
         several = found[counts >= max(_PART * len(inside), _ENOUGH_POINTS)]
         if len(several) < 2:
             continue
         inside = inside[np.isin(of_points[inside], several)]
-        rows, columns = np.nonzero(segments == segment)
+        rows, columns = np.nonzero(segments[box] == segment)
+        rows, columns = rows + box[0].start, columns + box[1].start
         count = min(_NEAREST, len(inside))
         nearest = cKDTree(photo.xy[inside]).query(np.stack([columns, rows], 1), count)[1]
         votes = (of_points[inside][nearest][..., None] == several).sum(1)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-_MANY = 1 / 50
+MANY = 1 / 50
 """Fraction of the regions that have to be merged in a round so that rounds are faster than single steps."""
 
 _PRIMES = (73_856_093, 19_349_663, 1_000_003)
@@ -47,7 +47,7 @@ def merge_tree(shared: sparse.csr_array, total: sparse.csr_array, least: float) 
     # Regions that are each other's best match are merged in any order, here as many as possible at once. This is slow
     # where one region is the best match of many others, but of few at a time.
     while True:
-        first, second, ratios = _mutual_matches(both, least)
+        first, second, ratios = mutual_matches(both, least)
         if not len(first):
             break
         into, results = np.arange(both.shape[0]), names.copy()
@@ -58,7 +58,7 @@ def merge_tree(shared: sparse.csr_array, total: sparse.csr_array, least: float) 
         before, names = both.shape[0], results[kept]
         contract = sparse.coo_array((np.ones(before), (np.arange(before), merged)), shape=(before, len(kept))).tocsr()
         both = (contract.T @ both @ contract).tocsr()
-        if before - len(kept) < _MANY * before:
+        if before - len(kept) < MANY * before:
             _merge_singly(both, least, names.tolist(), count, merges)
             break
     tree = np.array(merges).reshape(-1, 3)
@@ -153,8 +153,13 @@ def stable_regions(tree: MergeTree, sizes: np.ndarray, smallest: float, least: f
     return label[:count]
 
 
-def _mutual_matches(both: sparse.csr_array, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pairs of regions that are each other's best match, and what they have in common."""
+def mutual_matches(both: sparse.csr_array, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pairs of regions that are each other's best match, and what they have in common.
+
+    Args:
+        both: (n, n), what two regions could share, plus what they share as imaginary part.
+        least: the smallest ratio of both with which regions match.
+    """
     pairs = both.tocoo()
     first, second, ratio = pairs.row, pairs.col, pairs.data.imag / pairs.data.real
     good = (first < second) & (ratio >= least)

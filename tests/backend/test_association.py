@@ -10,7 +10,7 @@ from scipy import sparse
 
 from backend.capture import load_capture
 from backend.capture.files import read_mask
-from backend.labels.association import Seen, associate, consistency, object_mask
+from backend.labels.association import LEAST, Seen, _merged, associate, consistency, object_mask
 from backend.labels.regions import merge_regions, merge_tree, stable_regions
 from backend.labels.renumbering import renumber_masks
 from backend.shared.errors import EXIT_DONE
@@ -72,6 +72,26 @@ def test_merging_agrees_with_its_definition(count):
     for least in (0.3, 0.5, 0.7):
         found = merge_regions(sparse.csr_array(shared), sparse.csr_array(total), least)
         assert partition(found) == greedy(shared, total, least)
+
+
+def test_segments_are_merged_as_by_all_pairs():
+    """Also where most pairs share no points, and where segments of one photo are merged by way of others."""
+    rng = np.random.default_rng(0)
+    photos, each, points = 12, 5, 120
+    of_photo = np.repeat(np.arange(photos), each)
+    visible = rng.random((photos, points)) < 0.6
+    members = np.zeros((photos * each, points))
+    for photo in range(photos):
+        part = np.arange(points) * 4 // points + (rng.random(points) < 0.2)
+        for segment in range(each):
+            members[photo * each + segment] = visible[photo] & (part == segment)
+    together, inside = members @ members.T, members @ visible.T
+    either = inside[:, of_photo] + inside[:, of_photo].T - together
+    for full in (together, either):
+        np.fill_diagonal(full, 0)
+    own = of_photo[:, None] == np.arange(photos)
+    found = _merged(*(sparse.csr_array(a.astype(float)) for a in (together, inside, own)))
+    assert partition(found) == greedy(together, either, LEAST) and 3 < found.max() + 1 < photos * each
 
 
 def seen(points, segments):
