@@ -17,7 +17,7 @@ from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json, write_json
 from ..shared.formats.regular_file import read_regular
 from .capture import Capture, Points, View, needs_no_resampling
-from .files import encode_mask, image_size, read_image, write_image
+from .files import encode_mask, image_size, mask_size, read_image, write_image
 from .survey import Source, Survey, check_mask, check_size, distinct_ids, refuse, run_in_parallel, survey_capture
 from .undistort import resample_image, resample_mask
 
@@ -96,6 +96,10 @@ def load_capture(
             not survey.on_objects
             and all(
                 needs_no_resampling(source.camera, source.target.width, source.target.height)
+                and (
+                    source.mask_path is None
+                    or mask_size(source.mask_path) == (source.target.width, source.target.height)
+                )
                 for source in survey.sources
             )
         ),

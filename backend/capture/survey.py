@@ -37,6 +37,7 @@ from .files import (
     read_names,
     same_shape,
 )
+from .made_masks import is_made
 from .models import none_found, photos_folder, read_capture_model
 from .undistort import Pinhole, is_pinhole, pinhole_for
 
@@ -172,7 +173,8 @@ def survey_capture(
         )
     if unmasked:
         first = masks_folder / Path(unmasked[0]).with_suffix(".png")
-        if 2 * len(unmasked) > present:
+        # Masks made here are of the photos that somebody has annotated or that are trained on.
+        if 2 * len(unmasked) > present and not is_made(masks_folder):
             problem(
                 f"The mask {first} is missing, as are those of {len(unmasked)} of {present} images: add them, or "
                 f"remove {masks_folder} to work without objects."

@@ -247,6 +247,65 @@ def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_
     )
 
 
+@pytest.mark.parametrize("write", [write_coco_polygons, write_cvat_images, write_label_studio])
+def test_photos_that_nobody_has_annotated_get_no_mask(write, photos, tmp_path, run_command):
+    """Their objects would be lost otherwise."""
+    path = write(tmp_path)
+    for number in (2, 3, 4):
+        Image.new("RGB", SIZE).save(photos / "images" / photo(number))
+    content = path.read_text()
+    if write is write_cvat_images:
+        more = f'<image id="2" name="{photo(2)}" width="{SIZE[0]}" height="{SIZE[1]}"></image></annotations>'
+        path.write_text(content.replace("</annotations>", more))
+    else:
+        listed = json.loads(content)
+        entries = listed["images"] if write is write_coco_polygons else listed
+        as_text = json.dumps(entries[1]).replace(photo(1), photo(2))
+        more = {**json.loads(as_text), "id": 7, **({} if write is write_coco_polygons else {"annotations": []})}
+        entries.append(more)
+        path.write_text(json.dumps(listed))
+    done = run_command("masks", photos, path)
+    assert done.code == EXIT_DONE, done.err
+    assert {each.name for each in (photos / "masks").glob("*.png")} == {f"{photo(n)}.png" for n in (0, 1)}
+
+
+def test_frames_of_a_video_are_the_photos_in_the_folder(photos, tmp_path, run_command):
+    path = write_cvat_video(tmp_path)
+    frames = path.read_text().replace("<task>", "<task><size>{}</size>")
+    path.write_text(frames.format(3))
+    assert_rejected(run_command("masks", photos, path), "3 frames", "2 photos")
+    path.write_text(frames.format(2))
+    assert run_command("masks", photos, path).code == EXIT_DONE
+
+
+def test_255_is_white_only_where_all_masks_are_black_and_white(photos, tmp_path):
+    for values, expected in (((0, 255), {1}), ((0, 85, 255), {85, 255})):
+        given = tmp_path / str(len(values))
+        given.mkdir()
+        Image.fromarray(np.resize(np.array(values, np.uint8), SIZE[::-1])).save(given / "photo 0.png")
+        Image.fromarray(np.resize(np.array([0, 255], np.uint8), SIZE[::-1])).save(given / "photo 1.png")
+        source = open_source(given, photos, [photo(0), photo(1)])
+        assert {key for n in (0, 1) for key in source.read(photo(n)).objects} == expected
+
+
+def test_masks_of_a_missing_photo_are_left_out(write_capture, tmp_path, run_command):
+    scene = write_capture(views=6)
+    given = (scene.folder / "masks").rename(tmp_path / "given")
+    (scene.folder / "images" / scene.names[2]).unlink()
+    assert run_command("masks", scene.folder, given, "--objects", "given").code == EXIT_DONE
+    assert len(list((scene.folder / "masks").glob("*.png"))) == 5
+
+
+def test_imported_masks_of_few_photos_can_be_used(write_capture, tmp_path, run_command):
+    scene = write_capture(views=6)
+    given = (scene.folder / "masks").rename(tmp_path / "given")
+    for path in sorted(given.glob("*.png"))[2:]:
+        path.unlink()
+    assert run_command("masks", scene.folder, given, "--objects", "given").code == EXIT_DONE
+    result = run_command("vote", scene.folder, "--out", tmp_path / "out")
+    assert result.code == EXIT_DONE and "have no mask" in result.err + result.out
+
+
 @pytest.mark.parametrize("masks", ["images/photo {}_mask.jpg", "masks/photo {}.jpg"])
 def test_black_and_white_jpegs_become_masks_of_the_capture(photos, tmp_path, masks):
     (photos / "masks").mkdir()

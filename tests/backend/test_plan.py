@@ -563,3 +563,11 @@ def test_training_without_plan_resumes(write_capture, tmp_path, run_command):
     (out / "plan.json").unlink()
     assert run_command("report", out).code == EXIT_DONE and run_command(*train, 3).code == EXIT_DONE
     assert read_plan(out / "plan.json")["votes"].done
+
+
+def test_masks_may_have_another_size_than_the_photos(write_capture, run_command):
+    scene = write_capture(views=8)
+    for path in (scene.folder / "masks").glob("*.png"):
+        mask = Image.open(path)
+        mask.resize((mask.width // 2, mask.height // 2), Image.Resampling.NEAREST).save(path)
+    assert run_command("plan", scene.folder).code == EXIT_DONE

@@ -62,7 +62,8 @@ class CocoMasks:
                     self._annotations[name_of[annotation["image_id"]]].append(annotation)
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error
-        self.photos: Sequence[str] = sorted(self._sizes)
+        # Photos that nobody has annotated yet are listed, too.
+        self.photos: Sequence[str] = sorted(name for name, found in self._annotations.items() if found)
         self._is_panoptic = any("segments_info" in each for found in self._annotations.values() for each in found)
         self.what = "COCO panoptic masks" if self._is_panoptic else "COCO annotations"
         self._pictures = Files(file.parent) if self._is_panoptic else None

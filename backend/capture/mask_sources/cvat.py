@@ -12,7 +12,7 @@ import numpy as np
 from ...shared.errors import InputError
 from ...shared.formats.photos_source import natural_order
 from ..models.photos import Photos
-from .segments import Segments, Shape, checked_size, draw_shapes, polygon
+from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turned
 
 _SHAPES = ("polygon", "box", "ellipse", "mask")
 
@@ -24,24 +24,24 @@ class CvatMasks:
         root: its XML.
         file: the file, for messages.
         photos: the photos of the capture; the frames of a video are theirs in natural order.
-        names: the names of all photos.
 
     Raises:
-        InputError: the file is not valid.
+        InputError: the file is not valid, or of a video with another number of frames.
     """
 
     what = "CVAT annotations"
 
-    def __init__(self, root: Element, file: Path, photos: Photos, names: Sequence[str]) -> None:
+    def __init__(self, root: Element, file: Path, photos: Photos) -> None:
         self._file = file
         self._sizes: dict[str, tuple[int, int]] = {}
         self._shapes: dict[str, list[tuple[Element, str, Hashable]]] = {}
         try:
             self._read_images(root, photos)
-            self._read_tracks(root, names)
+            self._read_tracks(root, photos)
         except (TypeError, ValueError, KeyError) as error:
             raise self._invalid(error) from error
-        self.photos: Sequence[str] = sorted(self._shapes)
+        # Photos that nobody has annotated yet are listed, too.
+        self.photos: Sequence[str] = sorted(name for name, found in self._shapes.items() if found)
         self._is_unique = all(
             count == 1
             for found in self._shapes.values()
@@ -56,7 +56,7 @@ class CvatMasks:
                 self._sizes[name] = checked_size(width, height, f"{self._file}: {name}")
                 self._shapes[name] = [(each, each.get("label", ""), None) for each in image if each.tag in _SHAPES]
 
-    def _read_tracks(self, root: Element, names: Sequence[str]) -> None:
+    def _read_tracks(self, root: Element, photos: Photos) -> None:
         tracks = list(root.iter("track"))
         if not tracks:
             return
@@ -64,7 +64,13 @@ class CvatMasks:
         if size is None:
             raise ValueError("without original_size")
         width, height = (int(size.findtext(side, "")) for side in ("width", "height"))
-        ordered = sorted(names, key=natural_order)
+        ordered = sorted(photos.names, key=natural_order)
+        frames = root.findtext(".//meta//size")
+        if frames is not None and int(frames) != len(ordered):
+            raise InputError(
+                f"{self._file} is of a video of {frames} frames, and the capture has {len(ordered)} photos; annotate "
+                f"the photos in {photos.folder}."
+            )
         for track in tracks:
             key = ("track", track.get("id"))
             for each in track:
@@ -95,16 +101,19 @@ def _inside(element: Element, size: tuple[int, int]) -> np.ndarray:
     """Return the pixels (h, w) bool of a shape."""
     width, height = size
     values = element.attrib
+    degrees = float(values.get("rotation", 0.0))
     if element.tag == "polygon":
         return polygon([tuple(map(float, pair.split(","))) for pair in values["points"].split(";")], size)  # type: ignore[misc]
     if element.tag == "box":
         left, top, right, bottom = (float(values[key]) for key in ("xtl", "ytl", "xbr", "ybr"))
-        return polygon([(left, top), (right, top), (right, bottom), (left, bottom)], size)
+        corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+        return polygon(turned(corners, degrees, ((left + right) / 2, (top + bottom) / 2)), size)
     if element.tag == "ellipse":
         turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-        x = float(values["cx"]) + float(values["rx"]) * np.cos(turns)
-        y = float(values["cy"]) + float(values["ry"]) * np.sin(turns)
-        return polygon(list(zip(x.tolist(), y.tolist(), strict=True)), size)
+        center = float(values["cx"]), float(values["cy"])
+        x = center[0] + float(values["rx"]) * np.cos(turns)
+        y = center[1] + float(values["ry"]) * np.sin(turns)
+        return polygon(turned(list(zip(x.tolist(), y.tolist(), strict=True)), degrees, center), size)
     left, top, wide, tall = (int(values[key]) for key in ("left", "top", "width", "height"))
     runs = [int(run) for run in values["rle"].split(",")]
     fits = 0 <= left <= left + wide <= width and 0 <= top <= top + tall <= height

@@ -48,6 +48,7 @@ class MaskFiles:
         self._labels = {**read_names(folder.parent), **read_names(folder)} if self.files else {}
         color = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
         self._is_color = bool(color) and all(map(is_three_channel, color)) and any(map(is_color_mask, color))
+        self._is_black_and_white: bool | None = None
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
@@ -56,13 +57,25 @@ class MaskFiles:
             ids = read_black_and_white(path).astype(np.int64)
         else:
             ids = read_mask(path, self._is_color).astype(np.int64)
-            if set(np.unique(ids).tolist()) <= {0, 255}:
+            if _is_white(ids) and self._all_are_white():
                 ids = np.minimum(ids, 1)
         found, numbers = np.unique(ids, return_inverse=True)
         offset = 0 if len(found) and found[0] == 0 else 1
         values = found[1 - offset :].tolist()
         named = [self._labels.get(value, "") for value in values]
         return Segments((numbers.reshape(ids.shape) + offset).astype(np.int32), values, named)
+
+    def _all_are_white(self) -> bool:
+        """Return whether all files are in black and white; otherwise, 255 is the ID of an object as any other."""
+        if self._is_black_and_white is None:
+            paths = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
+            self._is_black_and_white = all(_is_white(read_mask(path, self._is_color)) for path in paths)
+        return self._is_black_and_white
+
+
+def _is_white(ids: np.ndarray) -> bool:
+    """Return whether a mask has no other values than 0 and 255."""
+    return bool(((ids == 0) | (ids == 255)).all())
 
 
 class MaskFolders:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...shared.errors import InputError
 from ..models.photos import Photos
-from .segments import Segments, Shape, checked_size, draw_shapes, polygon
+from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turned
 
 _UPLOAD = re.compile(r"^[0-9a-f]{8}-")
 _LABELS = ("brushlabels", "polygonlabels", "rectanglelabels", "ellipselabels", "labels")
@@ -52,17 +52,15 @@ class LabelStudioMasks:
                     self._results[name] = [each for each in results if "original_width" in each]
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error
-        self.photos: Sequence[str] = sorted(self._results)
+        # Photos that nobody has annotated yet are listed, too.
+        self.photos: Sequence[str] = sorted(name for name, found in self._results.items() if found)
         self._is_unique = all(
             count == 1 for found in self._results.values() for count in Counter(map(_label, found)).values()
         )
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
-        results = self._results[photo]
-        if not results:
-            raise InputError(f"{self._file} has no region for {photo}; label it, or remove its task.")
-        shapes = []
+        results, shapes = self._results[photo], []
         try:
             size = checked_size(results[0]["original_width"], results[0]["original_height"], f"{self._file}: {photo}")
             for each in results:
@@ -101,13 +99,14 @@ def _inside(result: Mapping[str, Any], size: tuple[int, int]) -> np.ndarray:
     if "points" in value:
         return polygon([(x / 100 * width, y / 100 * height) for x, y in value["points"]], size)
     x, y = value["x"] / 100 * width, value["y"] / 100 * height
+    degrees = float(value.get("rotation", 0.0))
     if "radiusX" in value:
         turns = np.linspace(0, 2 * np.pi, 64, endpoint=False)
         across = x + value["radiusX"] / 100 * width * np.cos(turns)
         down = y + value["radiusY"] / 100 * height * np.sin(turns)
-        return polygon(list(zip(across.tolist(), down.tolist(), strict=True)), size)
+        return polygon(turned(list(zip(across.tolist(), down.tolist(), strict=True)), degrees, (x, y)), size)
     right, bottom = x + value["width"] / 100 * width, y + value["height"] / 100 * height
-    return polygon([(x, y), (right, y), (right, bottom), (x, bottom)], size)
+    return polygon(turned([(x, y), (right, y), (right, bottom), (x, bottom)], degrees, (x, y)), size)
 
 
 def unpack(data: Sequence[int], count: int) -> np.ndarray:

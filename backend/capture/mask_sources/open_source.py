@@ -40,14 +40,14 @@ def open_source(path: Path, capture: Path, names: Sequence[str]) -> MaskSource:
     photos = Photos(capture)
     if not path.exists():
         raise InputError(f"{path} does not exist; {_ACCEPTED}.")
-    sources = _of_folder(path, photos, names) if path.is_dir() else [_of_file(path, photos, names)]
+    sources = _of_folder(path, photos, names) if path.is_dir() else [_of_file(path, photos)]
     source = max(sources, key=lambda each: len(each.photos))
     if not source.photos:
         raise InputError(f"{path} has masks of none of the {len(names)} photos, such as {names[0]}; {_ACCEPTED}.")
     return source
 
 
-def _of_file(path: Path, photos: Photos, names: Sequence[str]) -> MaskSource:
+def _of_file(path: Path, photos: Photos) -> MaskSource:
     try:
         data = read_regular(path, _LARGEST)
     except (OSError, ValueError) as error:
@@ -56,7 +56,7 @@ def _of_file(path: Path, photos: Photos, names: Sequence[str]) -> MaskSource:
         if path.suffix.lower() == ".xml":
             root = parse_xml(data)
             if root.tag == "annotations":
-                return cvat.CvatMasks(root, path, photos, names)
+                return cvat.CvatMasks(root, path, photos)
         elif path.suffix.lower() == ".json":
             content: Any = parse_json(data.decode("utf-8-sig"))
             if coco.recognizes(content):
@@ -81,5 +81,10 @@ def _of_folder(path: Path, photos: Photos, names: Sequence[str]) -> list[MaskSou
     ]  # fmt: skip
     described = [path / name for name in files.paths if re.fullmatch(r"[^/]+\.(json|xml)", name, re.IGNORECASE)]
     if len(described) == 1 and described[0].stem not in ("labels", "masks"):
-        found.append(_of_file(described[0], photos, names))
+        try:
+            found.append(_of_file(described[0], photos))
+        except InputError:
+            # The masks beside such a file can be used without it.
+            if not any(each.photos for each in found):
+                raise
     return found

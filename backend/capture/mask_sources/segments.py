@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
@@ -68,6 +69,15 @@ def polygon(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> np
     if len(corners) > 2:
         ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in corners], fill=1, outline=1)
     return np.array(image)
+
+
+def turned(
+    corners: Sequence[tuple[float, float]], degrees: float, about: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Return corners (x, y) in pixels, turned clockwise about a point of the image."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    x, y = about
+    return [(x + cos * (u - x) - sin * (v - y), y + sin * (u - x) + cos * (v - y)) for u, v in corners]
 
 
 def run_lengths(counts: Any, size: tuple[int, int]) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...capture.colmap import Model
-from ...capture.files import image_size, mask_names, read_image, read_mask, same_shape
+from ...capture.files import Files, image_size, mask_names, read_image, read_mask, same_shape
 from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, require_place_for_given, write_mask
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
@@ -96,7 +96,12 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if not segments_by_model:
         reporter.begin(READ, "Reading the masks")
     model = _model(capture, needed=options.objects == "find" or segments_by_model)
-    names = sorted(image.name for image in model.images) if model is not None else Photos(capture).names
+    own = Photos(capture)
+    images, names = own.folder, own.names
+    if model is not None:
+        # A photo that is missing is no reason to refuse the masks of the others.
+        there = Files(images)
+        names = sorted(image.name for image in model.images if there.find(image.name) is not None)
     if not names:
         raise InputError(f"{capture / 'images'} contains no photos; put them there.")
     _require_replaceable(capture, given)
@@ -106,7 +111,6 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     else:
         source = open_source(given, capture, names)
     photos = [name for name in source.photos if name in set(names)]
-    images = Photos(capture).folder
     segments = {name: _Packed(_checked(source, name, images, given)) for name in _counted(photos, reporter)}
     if not any(found.objects for found in segments.values()):
         if options.text is not None:
