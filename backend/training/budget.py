@@ -121,6 +121,11 @@ class Budget:
             if not p.converged_at:
                 return (GROW_UNTIL + (PLATEAU_UNTIL if p.grown else PLATEAU_FROM)) / 2
             decay = (p.step - p.converged_at) / (p.converged_at / DECAY_FROM - p.converged_at)
+            if self.seconds is not None:
+                # Steps take longer from here on, where images are not reduced any more.
+                begin = max(DECAY_FROM * self.seconds, _seconds_at(p, p.converged_at))
+                if begin < self.seconds:
+                    decay = max(decay, (p.seconds - begin) / (self.seconds - begin))
             return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * decay, 1.0)
         if self.steps is not None:
             done = (p.step - self.first_step) / max(self.steps - self.first_step, 1)
@@ -141,7 +146,7 @@ class Budget:
         if self.until_converged:
             end = expected_end(p)
             left = [] if end is None else [max(end - p.step, 0) * pace]
-            left += [] if self.seconds is None or p.converged_at else [max(self.seconds - p.seconds, 0.0)]
+            left += [] if self.seconds is None else [max(self.seconds - p.seconds, 0.0)]
             return min(left, default=None)
         if self.steps is not None:
             return max(self.steps - p.step, 0) * pace
@@ -203,6 +208,11 @@ class Budget:
         if self.seconds is None or p.converged_at or not p.step:
             return False
         return p.seconds >= DECAY_FROM * self.seconds
+
+
+def _seconds_at(p: TrainingProgress, step: int) -> float:
+    """Return the seconds of training until the last evaluation that is not after a step."""
+    return float(next((entry.get("seconds", 0.0) for entry in reversed(p.curve) if entry["step"] <= step), 0.0))
 
 
 def choose_validation_views(training: Sequence[int]) -> list[int]:

@@ -202,6 +202,19 @@ def test_time_limit_ends_training_until_converged():
         assert end.converged_at
 
 
+def test_time_limit_holds_where_the_last_steps_are_slower():
+    """As they are where images are not reduced any more."""
+    budget, p = (
+        Budget(seconds=100.0, until_converged=True),
+        TrainingProgress(step=1000, seconds=90.0, converged_at=1000),
+    )
+    assert budget.progress(p) < 0.81
+    p.step, p.seconds = 1020, 95.0
+    assert budget.progress(p) == pytest.approx(0.9) and budget.remaining(p, 0.25) == pytest.approx(5.0)
+    p.seconds = 100.0
+    assert budget.progress(p) == 1.0
+
+
 def test_remaining_time_is_estimated_from_curve():
     p, final = TrainingProgress(step=1000, seconds=50.0), PRESETS["final"]
     assert final.remaining(p, 0.05) is None and final.displayed_progress(p) == 1000 / (1000 + LOOKAHEAD)

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from backend.training.exposure.gains import measure_gains, varies
+from backend.training.exposure.gains import differences, measure_gains, varies
 
 
 def photos(gains, cameras, held_out=(), points=200, noise=0.0, hidden=0.0):
@@ -67,3 +67,9 @@ def test_held_out_views_are_at_the_common_exposure():
 
 def test_gains_without_observations_are_one():
     assert (measure_gains(photos(np.full((4, 3), 0.5), [1] * 4, points=5)) == 1).all()
+
+
+def test_views_without_a_gain_do_not_hide_a_variation():
+    own = np.repeat(np.exp([[-0.05], [0.05]]), 3, 1)
+    assert abs(differences(np.concatenate([own, np.ones((30, 3))])) - 0.05) < 1e-9
+    assert differences(np.ones((5, 3))) == 0.0

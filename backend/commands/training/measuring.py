@@ -45,18 +45,14 @@ class Measuring:
         figures = self._held_out(model, scene, allowed)
         self._spent += time.monotonic() - started
         capture = scene.capture
-        if capture.validation_indices:
-            validated = [
-                psnr(draw(model, scene.camera(index), want_ids=False).image, capture.image(index))
-                for index in capture.validation_indices
-            ]
-            figures["validation_psnr"] = float(np.mean(validated))
-        if progress.watched:
-            watched = []
-            for index in progress.watched:
-                photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
-                watched.append(psnr(color_corrected(drawn, photo), photo))
-            figures["watched_psnr"] = float(np.mean(watched))
+        for name, indices in (("validation_psnr", capture.validation_indices), ("watched_psnr", progress.watched)):
+            if indices:
+                # Their exposure is not known, since they are not trained on.
+                found = []
+                for index in indices:
+                    photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
+                    found.append(psnr(color_corrected(drawn, photo), photo))
+                figures[name] = float(np.mean(found))
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
             save_image(curve, self._folder.previews / "curve.png", quick=True)

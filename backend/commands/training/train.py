@@ -171,6 +171,11 @@ def _begin(
         plan = plan.settled_by(before)
     gains = context.gains if plan.does("exposure") else np.ones_like(context.gains)
     planned, wanted = planned_capture(context.capture, plan), planned_settings(settings(options), plan)
+    if not planned.train_indices:
+        raise InputError(
+            f"The plan leaves no photo of {capture.folder} to train on; add photos, or keep with --keep those that it "
+            "leaves out."
+        )
     if planned.has_masks:
         supervised = plan.does("rest") and not options.unlabeled_is_object
         planned, regions = correct_masks(planned, points.ids, supervised, reporter.check)

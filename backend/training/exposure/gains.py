@@ -70,8 +70,12 @@ def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
 
 
 def differences(gains: np.ndarray) -> float:
-    """Return the largest standard deviation, over the channels, of the logarithms of the gains (V, 3)."""
-    return float(np.log(gains).std(0).max())
+    """Return the largest standard deviation, over the channels, of the logarithms of the gains (V, 3).
+
+    Views without a gain of their own, all 1, do not count.
+    """
+    own = gains[(gains != 1.0).any(1)]
+    return float(np.log(own).std(0).max()) if len(own) else 0.0
 
 
 def varies(gains: np.ndarray) -> bool:
