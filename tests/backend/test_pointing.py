@@ -39,6 +39,9 @@ from backend.raster import Camera, object_ranks, rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.formats.points_ply import read_points
+from backend.shared.reconstruction.folder import Reconstruction
+from backend.shared.reconstruction.objects import edit_objects
+from backend.shared.reconstruction.record import read_record
 from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
 from backend.training.state import load_model, read_checkpoint
@@ -264,8 +267,16 @@ def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_c
     cameras = Scene(capture, model.classes, model.normalization)
     found = [(draw(model, cameras.camera(i)).ids == ids)[ids > 0].mean() for i, ids in enumerate(scene.ids)]
     assert np.median(found) > 0.9
-    # More strokes correct the result, and the training can go on.
+    # More strokes correct the result, also of an object that was unchecked, and the training can go on.
+    edit_objects(out / "objects.json", {5: {"left_out": True}})
     assert run_command("label", out, "--strokes", strokes).code == EXIT_DONE
+    assert read_record(Reconstruction(out)).training.left_out == []
+    model, _, _ = load_model(out / "checkpoint")
+    found = [
+        (draw(model, cameras.camera(i)).ids == ids)[ids == 5].mean() for i, ids in enumerate(scene.ids) if 5 in ids
+    ]
+    assert np.median(found) > 0.8
+    edit_objects(out / "objects.json", {5: {"left_out": False}})
     assert run_command("train", scene.folder, "--out", out, "--steps", 230, "--offsets", 4).code == EXIT_DONE
     entries = json.loads((out / "objects.json").read_text())["objects"]
     assert [entry["name"] for entry in entries] == ["ball", "object 2", "object 5"]

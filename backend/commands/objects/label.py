@@ -149,7 +149,11 @@ def begin_border_training(
     voting = argparse.Namespace(strategy=votes.strategy, seed=settings.seed, max_size=votes.max_size)
     # What is far from all strokes has no object, which is no reason for a warning.
     cast_votes(folder, capture, voting, Reporter())
-    objects, _ = find_requested_objects(folder, capture)
+    # An object that was unchecked since the training has splats, and is separated from the others, too.
+    objects = [
+        replace(entry, left_out=entry.left_out and entry.id in before.left_out)
+        for entry in find_requested_objects(folder, capture)[0]
+    ]
     wanted = Choices(settings, votes.max_size, until_converged=before.preset == "final")
     points = read_points(folder.points)
     context = build_context(capture, wanted, objects, reporter, points, thorough=True, resumed=plan_of(before))
