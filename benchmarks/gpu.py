@@ -39,6 +39,7 @@ if str(ROOT) not in sys.path:
 
 from backend.raster import Camera
 from backend.raster.devices import why_not_cuda
+from backend.raster.settings import EPS_2D
 from backend.raster.splats import HALF_H, HALF_W, SPLAT_COLUMNS, U, V
 
 SIZES = (
@@ -205,7 +206,7 @@ def gsplat_step(scene: Scene) -> tuple[Callable[[], object], Callable[[], object
 
     def forward() -> Any:
         return rasterization(
-            *leaves, viewmats, Ks, scene.camera.width, scene.camera.height, sh_degree=1, packed=False
+            *leaves, viewmats, Ks, scene.camera.width, scene.camera.height, sh_degree=1, packed=False, eps2d=EPS_2D,
         )  # fmt: skip
 
     def step() -> None:

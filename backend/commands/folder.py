@@ -30,7 +30,7 @@ from ..shared.stopping import StoppingReporter
 from ..training.budget import TrainingProgress
 from ..training.exposure.gains import measure_gains
 from ..training.scene import Scene
-from ..training.state import load_model, progress_of
+from ..training.state import blur_warning, load_model, progress_of
 from .cameras import write_capture_cameras
 from .setup.device import choose_device
 from .stages import stage
@@ -205,8 +205,9 @@ def open_trained(
     model, state, warning = load_model(
         checkpoint or folder.checkpoint, device, None if checkpoint is None else _no_anchors
     )
-    if warning:
-        reporter.warning(warning)
+    for each in (warning, blur_warning(state, folder.checkpoint)):
+        if each is not None:
+            reporter.warning(each)
     training = record.training
     if training is None:
         raise InputError(

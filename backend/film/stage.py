@@ -23,7 +23,7 @@ from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import SceneObject, default_name, read_objects
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
 
-_FORMAT = 2
+_FORMAT = 3
 """Version of the renders and files; a change causes all frames to be rendered again."""
 
 Tensors = dict[str, torch.Tensor]

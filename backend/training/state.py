@@ -240,9 +240,14 @@ def load_model(
         InputError: There is no checkpoint in `folder`, or none can be read.
     """
     tensors, state, warning = read_result(folder, keep)
-    if warning is None and state.get(BLUR_KEY) != BLUR[Settings(**state["settings"]).primitive]:
-        warning = _OTHER_BLUR.format(folder=folder)
     return model_from_checkpoint(tensors, state).to(device), state, warning
+
+
+def blur_warning(state: dict[str, Any], folder: Path) -> str | None:
+    """Return the warning about a checkpoint of a version with another low-pass filter, or None."""
+    if state.get(BLUR_KEY) == BLUR[Settings(**state["settings"]).primitive]:
+        return None
+    return _OTHER_BLUR.format(folder=folder)
 
 
 def progress_of(state: dict[str, Any]) -> TrainingProgress:

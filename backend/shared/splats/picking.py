@@ -230,7 +230,7 @@ def ids_in(objects: Sequence[PickObject], view: View, rectangle: Rectangle) -> s
         own = np.flatnonzero(inside & (splats.owner == owner))
         # The most opaque ones, which are the most visible.
         for index in own[np.argsort(-splats.opacity[own], kind="stable")[:_PROBES]]:
-            hit = _hit_at(splats, *np.floor(splats.center[index]) + 0.5)
+            hit = _hit_at(splats, *splats.center[index])
             if hit is not None and hit.object_id == object_id:
                 found.add(object_id)
                 break
