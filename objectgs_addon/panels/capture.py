@@ -133,6 +133,11 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     column = layout.column()
     if step.operator == "objectgs.set_up_backend":
         draw_online_access(column)
+        preferences = locations.preferences()
+        if preferences is not None:
+            device = column.row()
+            device.enabled = not jobs
+            device.prop(preferences, "device", expand=True)
     button = column.row()
     button.enabled = not (jobs or is_busy)
     button.scale_y = 1.5

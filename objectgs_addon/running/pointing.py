@@ -313,21 +313,20 @@ def _tell_taken(root: bpy.types.Collection, session: _Session) -> None:
 
 
 def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
-    """Mark the proposed objects, as one undo step."""
+    """Mark the proposed objects, as one undo step; if there are none, the marks stay as they are."""
     proposed, session.proposed = session.proposed, None
+    if not proposed or proposed.get("strokes") == []:
+        session.say("No objects were found by their shape; try another Detail, or draw over them")
+        return
     try:
-        marks.set_proposed(root, proposed or {})
+        marks.set_proposed(root, proposed)
     except (KeyError, TypeError, ValueError) as error:
         session.failure = f"the backend's answer is not valid ({error!r})"
         return
-    count = len(root.objectgs.marked)
-    if count:
-        session.say(
-            f"{count} objects were found. Remove those that are none, merge parts, and draw over what is missing; then "
-            "press Separate Objects. Another Detail gives more or fewer"
-        )
-    else:
-        session.say("No objects were found by their shape; try another Detail, or draw over them")
+    session.say(
+        f"{len(root.objectgs.marked)} objects were found. Remove those that are none, merge parts, and draw over what "
+        "is missing; then press Separate Objects. Another Detail gives more or fewer"
+    )
     windows = bpy.context.window_manager.windows
     if windows and not bpy.app.background:
         with bpy.context.temp_override(window=windows[0]):

@@ -44,7 +44,12 @@ ASSIGN = Step(
     "objectgs.assign_objects", "Assign Objects", "GROUP_VERTEX", "The masks decide which object each point belongs to."
 )
 TRAIN = Step("objectgs.train", "Train", "PLAY", "Training turns the photos into splats.")
-RESUME = Step("objectgs.train", "Resume", "PLAY", "The training was stopped, and goes on from there.")
+RESUME = Step(
+    "objectgs.train",
+    "Resume",
+    "PLAY",
+    "The training was stopped, and goes on from there. If the splats are good enough, go on in the panels below.",
+)
 FIND = Step(
     "objectgs.import_capture",
     "Find Capture",
@@ -87,7 +92,10 @@ SET_UP_RENDER = Step(
     "objectgs.set_up_render", "Set Up Render", "SCENE", "Splats need other render settings than Blender's defaults."
 )
 FILM = Step(
-    "objectgs.film_frames", "Render Film Frames", "RENDER_ANIMATION", "Film frames are rendered from the splats."
+    "objectgs.film_frames",
+    "Render Film Frames",
+    "RENDER_ANIMATION",
+    "Renders the splats through the scene's camera, from Frame Start to End in the panel Film.",
 )
 
 

@@ -206,10 +206,11 @@ def _selected_keys(parts: Sequence[bpy.types.Object]) -> np.ndarray:
 
 
 def _unused_id(root: bpy.types.Collection, edits: SplatEdits) -> int:
-    """Return an object ID that neither an object, nor a splat, nor an edit has."""
+    """Return an object ID that neither an object, nor a marked one, nor a splat, nor an edit has."""
     path = Reconstruction(scene.folder_of(root)).objects
     used = {entry.id for entry in read_objects(path)} | set(scene.object_collections(root))
     used.update(np.unique(edits.rows["object_id"]).tolist())
+    used.update(item.object_id for item in root.objectgs.marked)
     largest = max(used, default=0)
     return largest + 1 if largest < LARGEST_ID else next(i for i in range(1, LARGEST_ID) if i not in used)
 

@@ -30,7 +30,7 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
         if not need.splats(cls, context):
             return False
         if context.scene.camera is None:
-            cls.poll_message_set("The scene has no camera; choose one")
+            cls.poll_message_set("The scene has no camera; press New Camera from View in the panel Render")
             return False
         return True
 

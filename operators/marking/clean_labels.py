@@ -14,8 +14,8 @@ class CleanUpLabels(bpy.types.Operator):
     bl_idname = "objectgs.clean_up_labels"
     bl_label = "Clean Up Labels"
     bl_description = (
-        "Correct parts of masks that the other photos contradict, and give the splats their objects anew. It takes a "
-        "minute or two. The masks before are kept in the folder masks-given of the capture"
+        "Correct parts of masks that the other photos contradict, and give the splats their objects anew. It takes up "
+        "to a fifth of the time of the training. The masks before are kept in the folder masks-given of the capture"
     )
     bl_options = STARTS_JOB
 

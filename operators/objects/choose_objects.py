@@ -44,7 +44,7 @@ class ChooseObjects(bpy.types.Operator):
             "INVERT": {object_id for object_id, chosen in rows.items() if not chosen},
         }[self.which] & set(rows)
         if not kept:
-            raise InputError("No object would be left to train")
+            raise InputError("No object would be left to train; keep at least one checked")
         object_edits.choose(root, {object_id: object_id in kept for object_id in rows})
 
 

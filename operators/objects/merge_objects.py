@@ -94,7 +94,7 @@ class SplitObjects(bpy.types.Operator):
             or any(other.is_merged and other.merged_into == item.object_id for other in root.objectgs.objects)
         ):
             return True
-        cls.poll_message_set("The active object is not merged with another")
+        cls.poll_message_set("The active object is not merged with another; choose the row of one that is")
         return False
 
     @reports_errors

@@ -389,6 +389,16 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
     assert parts == [(3, 2), (3, 0), (3, 0), (3, 1)], "what was an object stays a part of its own"
 
 
+def test_marks_stay_if_no_objects_are_proposed(root, session):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    marks.add_stroke(root, marks.add_object(root).object_id, views(root)[0], [(1, 1)], area=False)
+    before = (len(root.objectgs.marked), marks.content(root))
+    session.propose(0.6)
+    session.take({"type": "answer", "request": session.asked, "proposed": {"strokes": [], "everything": True}})
+    pointing._show_proposed(root, session)
+    assert (len(root.objectgs.marked), marks.content(root)) == before and "No objects were found" in session.message
+
+
 def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     session.propose(0.6)

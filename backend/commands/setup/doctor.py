@@ -22,6 +22,7 @@ def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     found = machine_facts(device)
     for key, value in found.items():
         reporter.status(f"{key}: {value}")
+    uses = "the CPU" if device.type == "cpu" else found["device"]
     why_not = devices.why_not_cuda()
     if why_not is not None:
         reporter.status(f"CUDA is not used: {why_not}")
@@ -30,4 +31,5 @@ def doctor(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     started = time.monotonic()
     try_kernels(reporter, device)
     seconds = time.monotonic() - started
-    reporter.done(message=f"The backend works; the kernels were ready in {seconds:.1f} s.", machine=found)
+    works = f"The backend works, and training uses {uses}; the kernels were ready in {seconds:.1f} s."
+    reporter.done(message=works, machine=found)
