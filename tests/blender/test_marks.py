@@ -396,7 +396,7 @@ def test_marks_stay_if_no_objects_are_proposed(root, session):
     session.propose(0.6)
     session.take({"type": "answer", "request": session.asked, "proposed": {"strokes": [], "everything": True}})
     pointing._show_proposed(root, session)
-    assert (len(root.objectgs.marked), marks.content(root)) == before and "No objects were found" in session.message
+    assert (len(root.objectgs.marked), marks.content(root)) == before and "No objects were found" in session.said
 
 
 def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
