@@ -260,7 +260,11 @@ def test_fill_continues_ground_under_removed_object(place):
     for shown in (apply_edits(splats, [replace(objects[0], fill=False)]), edited):
         shown = transformed(shown, np.linalg.inv(place))
         alphas.append(render(shown.select((np.abs(shown.means[:, :2]) < 0.3).all(1)), view)[..., 3])
-    assert alphas[0][8:16, 8:16].max() < 0.1 and alphas[1].min() > 0.9
+    assert alphas[0][8:16, 8:16].max() < 0.1
+    in_hole = np.zeros((24, 24), bool)
+    in_hole[8:16, 8:16] = True
+    lowest = [np.percentile(alphas[1][there], 5) for there in (in_hole, ~in_hole)]
+    assert lowest[0] > lowest[1] - 0.01 and alphas[1][in_hole].min() > 0.85
     # Splats away from the rim stay the same, in the same order.
     kept = edited.select(~edited.unobserved)
     others = splats.select(splats.object_ids != 1)
