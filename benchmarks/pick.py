@@ -91,7 +91,7 @@ def placed(splats, matrix: np.ndarray | None = None) -> list[PickObject]:
     found = []
     for object_id in np.unique(splats.object_ids):
         own = splats.object_ids == object_id
-        cloud = Cloud(splats.means[own], splats.quats[own], splats.scales[own], splats.opacities[own])
+        cloud = Cloud(splats.means[own], splats.quats[own], splats.scales[own], splats.opacities[own], splats.blur)
         found.append(PickObject(int(object_id), cloud, matrix))
     return found
 
@@ -108,7 +108,7 @@ def rendered_ids(splats, view: View) -> np.ndarray:
     """Return the renderer's object IDs (H, W); -1 where nothing is drawn."""
     known, index = np.unique(splats.object_ids, return_inverse=True)
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]])
-    camera = Camera(view.viewmat, K, view.width, view.height, view.near)
+    camera = Camera(view.viewmat, K, view.width, view.height, view.near, splats.blur)
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = [torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays]
     drawn = rasterize(*tensors, torch.from_numpy(index.astype(np.int32)), camera)

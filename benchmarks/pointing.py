@@ -124,7 +124,7 @@ def copy_without_masks(folder: Path, copy: Path) -> None:
 def scores(checkpoint: Path, truth: Capture) -> dict[str, float]:
     """Return the scores of a trained model's IDs and images in the held-out views."""
     model, _, _ = load_model(checkpoint)
-    scene = Scene(truth, model.classes, model.normalization)
+    scene = Scene(truth, model.classes, model.normalization, blur=model.blur)
     found, images = IdScores(False), []
     for index in truth.test_indices:
         drawn, mask = draw(model, scene.camera(index)), truth.mask(index)
@@ -138,7 +138,7 @@ def matched(checkpoint: Path, truth: Capture) -> dict[str, float]:
     """Return the scores of a trained model whose objects have other IDs: each true object is compared with the one that
     fits it, so that the sum of the IoU is largest."""
     model, _, _ = load_model(checkpoint)
-    scene = Scene(truth, model.classes, model.normalization)
+    scene = Scene(truth, model.classes, model.normalization, blur=model.blur)
     rows, columns = int(model.classes.ids.max()) + 1, int(truth.object_ids.max()) + 1
     shown, images = np.zeros((rows, columns)), []
     for index in truth.test_indices:

@@ -8,7 +8,7 @@ processes and lets them take turns:
 
 The exact image is that of the float64 reference, which draws every splat in exact order, without the cut-off at
 ALPHA_MIN (only splats that add less than 1e-12 to each pixel are omitted) and without TRANSMITTANCE_THRESHOLD. The
-constants that define the image, ALPHA_MAX and EPS_2D, are the same in all variants.
+constants that define the image, ALPHA_MAX and the low-pass filter, are the same in all variants.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
     import torch
 
     from backend.raster.reference import _footprints, rotation_matrices
-    from backend.raster.settings import EPS_2D, TAN_MARGIN
+    from backend.raster.settings import TAN_MARGIN
 
     means, quats, scales, opacities = (torch.from_numpy(scene[name]).double() for name in PARAMETERS[:4])
     W, t = (torch.from_numpy(camera.viewmat[:3, columns]) for columns in (slice(3), 3))
@@ -99,7 +99,7 @@ def _reaches(scene: Any, camera: Any) -> np.ndarray:
     ahead = p[:, 2] > camera.near
     p = torch.where(ahead[:, None], p, 1.0)
     axes = W @ rotation_matrices(quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)) * scales[:, None, :]
-    a, _, c, _ = _footprints(p, axes, camera, EPS_2D, TAN_MARGIN)
+    a, _, c, _ = _footprints(p, axes, camera, camera.blur, TAN_MARGIN)
     reach = torch.sqrt(2 * torch.log(opacities.clamp(min=2 * NOTHING) / NOTHING))
     fx, fy, cx, cy = (float(v) for v in camera.arrays()[1])
     u, v = fx * p[:, 0] / p[:, 2] + cx, fy * p[:, 1] / p[:, 2] + cy

@@ -247,7 +247,7 @@ def open_trained(
     zero_is_object = state["settings"]["zero_is_object"]
     scene = Scene(
         capture, model.classes, model.normalization, zero_is_object, memory_for_targets(options),
-        supervise_background=state["supervise_background"], gains=gains,
+        supervise_background=state["supervise_background"], gains=gains, blur=model.blur,
     )  # fmt: skip
     return Trained(folder, capture, model, scene, progress_of(state), plan, training, warning is None)
 

@@ -89,7 +89,7 @@ def fill_hole(
         (N,) bool: the splats at the rims of the holes that the filling replaces, and the filling splats, which are
         unobserved and have the IDs of the surface that they continue.
     """
-    gone, parts = np.zeros(len(splats), bool), [Splats.empty(splats.degree)]
+    gone, parts = np.zeros(len(splats), bool), [splats.select(slice(0, 0))]
     solid = reliable_centers(removed.means, removed.opacities)
     if len(solid) < FEWEST:
         return gone, parts[0]

@@ -202,6 +202,7 @@ class _Sums:
             opacities=(self.opacity[slots] / weight[:, 0]).astype(np.float32),
             sh=sh.astype(np.float32),
             object_ids=model.classes.ids_of(owners),
+            blur=model.blur,
         )
 
 

@@ -49,6 +49,7 @@ def _coarser(splats: Splats, levels: int) -> list[Splats]:
             built.merged.harmonics[rows].astype(np.float32),
             np.full(count, splats.object_ids[0]),
             np.full(count, splats.unobserved[0]),
+            splats.blur,
         )
         found.append(concatenate([merged, left]))
         start += count

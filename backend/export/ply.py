@@ -21,13 +21,16 @@ from ..shared.formats.splat_ply import (
     SMALLEST_QUAT,
     UNOBSERVED,
     background_comment,
+    blur_comment,
     coefficients_of,
     property_names,
+    read_blur,
     read_splat_table,
     sh_names,
     splat_dtype,
     unobserved_of,
 )
+from ..shared.splats.blending import EPS_2D
 
 OPACITY_MARGIN = 1e-7
 """Smallest distance of opacities from 0 and 1, so that their logits are finite in float32."""
@@ -78,10 +81,10 @@ def write_splat_parts(
     Raises:
         ValueError: As from `write_splats`.
     """
-    path, total, count, degree, some_unobserved = Path(path), 0, 0, 0, False
+    path, total, count, degree, blur, some_unobserved = Path(path), 0, 0, 0, EPS_2D, False
     positions = PositionRange()
     for part in make():
-        total, degree = total + len(part), part.degree
+        total, degree, blur = total + len(part), part.degree, part.blur
         part = only_usable(part)
         if len(part) and (part.object_ids.min() < 0 or part.object_ids.max() > LARGEST_ID):
             raise ValueError("object IDs must be from 0 to 2^32 - 1")
@@ -98,7 +101,7 @@ def write_splat_parts(
     if with_ids and some_unobserved:
         names.append(UNOBSERVED)
     dtype = splat_dtype(names, positions.kind)
-    comments = [background_comment(background)] if background else []
+    comments = [blur_comment(blur), *([background_comment(background)] if background else [])]
     write_vertex_blocks(path, dtype, count, (_rows(only_usable(part), dtype) for part in make()), comments)
     return count, warnings
 
@@ -221,7 +224,8 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     with np.errstate(over="ignore"):
         scales = np.exp(np.maximum(scales, math.log(SMALLEST_SCALE)))
     opacities = 1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80)))
-    splats, dropped = cleaned(path, Splats(means, quats, scales, opacities, sh, object_ids, unobserved), keep)
+    read = Splats(means, quats, scales, opacities, sh, object_ids, unobserved, read_blur(path))
+    splats, dropped = cleaned(path, read, keep)
     return splats, warnings + dropped
 
 

@@ -10,6 +10,7 @@ from ..model.splats import Splats
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
+from ..shared.splats.blending import USUAL_EPS_2D
 from ..shared.splats.spherical_harmonics import C0
 from .ply import cleaned, rounding_warnings
 
@@ -66,5 +67,7 @@ def read_splat(path: Path) -> tuple[Splats, list[str]]:
     sh = ((color[:, :3] - 0.5) / C0).astype(np.float32)[:, None]
     quats = (rows["quat"].astype(np.float32) - 128.0) / 128.0
     ids = np.zeros(len(rows), np.int64)
-    splats = Splats(rows["mean"].copy(), quats, rows["scale"].astype(np.float64), color[:, 3], sh, ids)
+    splats = Splats(
+        rows["mean"].copy(), quats, rows["scale"].astype(np.float64), color[:, 3], sh, ids, blur=USUAL_EPS_2D
+    )
     return cleaned(path, splats)

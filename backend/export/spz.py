@@ -19,6 +19,7 @@ from ..model.splats import Splats
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
+from ..shared.splats.blending import USUAL_EPS_2D
 from .ply import cleaned, rounding_warnings
 
 DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -142,9 +143,9 @@ def read_spz(path: Path) -> tuple[Splats, list[str]]:
     sh[:, 1:] = (others.reshape(count, rest, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
     quats = _three_components(rotations) if version == 2 else _smallest_three(rotations)
     logs = scales / _SCALE_STEP + _SMALLEST_LOG
-    splats, warnings = cleaned(
-        path, Splats(means, quats, np.exp(logs), alphas[:, 0] / 255.0, sh, np.zeros(count, np.int64))
-    )
+    ids = np.zeros(count, np.int64)
+    read = Splats(means, quats, np.exp(logs), alphas[:, 0] / 255.0, sh, ids, blur=USUAL_EPS_2D)
+    splats, warnings = cleaned(path, read)
     if degree > _DEGREE_KEPT:
         warnings.append(f"{path.name} has spherical harmonics of degree {degree}, of which {_DEGREE_KEPT} are kept.")
     return splats, warnings

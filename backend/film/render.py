@@ -88,7 +88,7 @@ def to_srgb_8bit(rgba: NDArray) -> NDArray[np.uint8]:
 
 
 def _draw(stage: Stage, shot: Shot, sample: Sample, with_depth: bool) -> Rendered:
-    camera = Camera(sample.viewmat, sample.K, shot.width, shot.height, near=sample.clip[0])
+    camera = Camera(sample.viewmat, sample.K, shot.width, shot.height, near=sample.clip[0], blur=stage.blur)
     splats: dict[str, Any] = stage.at(sample, shot.only_named)
     with torch.no_grad():
         return rasterize(

@@ -23,7 +23,7 @@ from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.objects import SceneObject, default_name, read_objects
 from ..shared.reconstruction.shot import Frame, Placed, Sample, Shot
 
-_FORMAT = 3
+_FORMAT = 4
 """Version of the renders and files; a change causes all frames to be rendered again."""
 
 Tensors = dict[str, torch.Tensor]
@@ -32,7 +32,10 @@ Tensors = dict[str, torch.Tensor]
 class Stage:
     """The splats of a reconstruction with their edits, to be rendered with the transforms of a sample.
 
-    names: names of the objects by class index; the rendered IDs are class indices.
+    Attributes:
+        names: names of the objects by class index; the rendered IDs are class indices.
+        primitive: "3d" or "2d".
+        blur: variance of the low-pass filter of the splats.
     """
 
     def __init__(self, folder: Reconstruction, primitive: str, device: torch.device, reporter: Reporter) -> None:
@@ -42,6 +45,7 @@ class Stage:
             reporter.warning(warning)
         objects = read_objects(folder.objects) if folder.objects.exists() else []
         self.primitive = primitive
+        self.blur = splats.blur
         self._device = device
         self._digest = _digest_of(folder, objects, primitive)
         self._entries = {entry.id: entry for entry in objects}

@@ -18,7 +18,7 @@ ALPHA_SEEN = 0.5
 
 _REACH = 3.4
 """Radius of a splat in standard deviations: sqrt(2 ln 255) and a margin."""
-_BORDER = 1.5
+_BORDER = 1.9
 """Number of pixels by which the renderer's low-pass filter enlarges the radius of a splat."""
 
 

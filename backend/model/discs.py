@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from ..shared.splats.blending import EPS_2D
 from .anchors import LOG_EXTENT_MAX
 from .object_model import ObjectModel
 
@@ -52,7 +53,7 @@ def to_discs(model: ObjectModel) -> ObjectModel:
         rows[:, scale_columns] = extent.log()
     return replace(
         model, anchors=replace(anchors, rows=rows), heads=copy.deepcopy(model.heads),
-        background=model.background.detach().clone(), primitive="2d",
+        background=model.background.detach().clone(), primitive="2d", blur=EPS_2D,
     )  # fmt: skip
 
 

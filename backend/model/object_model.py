@@ -12,6 +12,7 @@ from ..gpu.kernel import kernel as gpu_kernel
 from ..raster import devices
 from ..raster.kernel import kernel
 from ..shared.class_table import ClassTable
+from ..shared.splats.blending import EPS_2D
 from .anchors import LOG_EXTENT_MAX, Anchors
 from .generate import Generated, generate
 from .heads import Heads
@@ -69,6 +70,7 @@ class ObjectModel:
         classes: the object IDs of the anchors' class indices; class 0 is "no object".
         normalization: transform between the capture's world and scene units.
         primitive: "3d" Gaussians or "2d" discs.
+        blur: variance in square pixels of the low-pass filter with which 3D Gaussians are trained and drawn.
     """
 
     anchors: Anchors
@@ -77,6 +79,7 @@ class ObjectModel:
     classes: ClassTable
     normalization: Normalization
     primitive: str = "3d"
+    blur: float = EPS_2D
 
     @property
     def device(self) -> torch.device:
@@ -137,7 +140,7 @@ class ObjectModel:
         means = converted(means, self.normalization.to_world)
         scales = converted(scales, lambda values: values.astype(np.float64) / self.normalization.scale)
         ids = converted(ids, self.classes.ids_of, np.int64)
-        return Splats(means, quats, scales, opacities, sh, ids), source
+        return Splats(means, quats, scales, opacities, sh, ids, blur=self.blur), source
 
 
 def _normalize(quats: np.ndarray) -> np.ndarray:
@@ -179,8 +182,8 @@ def _in_view(positions, rows, k, viewmat, intrinsics, width, height, near, seen)
         for p in range(4):
             side = px if p < 2 else py
             distance = (planes[p, 0] * side + planes[p, 1] * pz) / np.sqrt(planes[p, 0] ** 2 + planes[p, 1] ** 2)
-            # The low-pass filter, or a disc's minimum footprint, adds up to 1.5 pixels at the border.
-            margin = 1.5 * max(pz, near) / min(fx, fy)
+            # The low-pass filter, or a disc's minimum footprint, adds up to 1.9 pixels at the border.
+            margin = 1.9 * max(pz, near) / min(fx, fy)
             inside = inside and distance > -reach - margin
         seen[a] = inside
 

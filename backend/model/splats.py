@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from ..shared.splats.blending import EPS_2D
 
 ROWS_AT_ONCE = 1 << 16
 """Number of splats that are converted or written at a time, since models may take half of the memory."""
@@ -26,6 +28,7 @@ class Splats:
             color = max(0, basis(direction) . sh + 0.5).
         object_ids: (N,) int64 in 0 .. 2^32 - 1; 0 is "no object".
         unobserved: (N,) bool, generated to fill a hole and visible in no image; all False if not given.
+        blur: variance in square pixels of the low-pass filter with which they are to be drawn.
     """
 
     means: NDArray
@@ -35,6 +38,7 @@ class Splats:
     sh: NDArray
     object_ids: NDArray
     unobserved: NDArray = field(default_factory=lambda: np.zeros(0, bool))
+    blur: float = EPS_2D
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -83,6 +87,7 @@ class Splats:
             self.sh[rows],
             self.object_ids[rows],
             self.unobserved[rows],
+            self.blur,
         )
 
     def with_degree(self, degree: int) -> Splats:
@@ -91,11 +96,11 @@ class Splats:
         sh = np.zeros((len(self), k, 3), self.sh.dtype)
         keep = min(k, self.sh.shape[1])
         sh[:, :keep] = self.sh[:, :keep]
-        return Splats(self.means, self.quats, self.scales, self.opacities, sh, self.object_ids, self.unobserved)
+        return replace(self, sh=sh)
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
-    """Concatenate splats; spherical harmonics are padded with zeros to the highest degree."""
+    """Concatenate splats of the same filter; spherical harmonics are padded with zeros to the highest degree."""
     if not parts:
         return Splats.empty()
     degree = max(part.degree for part in parts)
@@ -108,6 +113,7 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
         np.concatenate([part.sh for part in parts]),
         np.concatenate([part.object_ids for part in parts]),
         np.concatenate([part.unobserved for part in parts]),
+        parts[0].blur,
     )
 
 
@@ -118,7 +124,16 @@ def gathered(parts: Iterable[Splats], most: int) -> Splats:
         parts: splats of one degree and of the same types; one part or more.
         most: upper bound of the number of splats. Rows that are not filled take addresses, but no memory.
     """
-    return Splats(**gathered_columns(map(vars, parts), most))
+    blur = EPS_2D
+
+    def arrays() -> Iterator[dict[str, NDArray]]:
+        nonlocal blur
+        for part in parts:
+            values = vars(part).copy()
+            blur = values.pop("blur")
+            yield values
+
+    return Splats(**gathered_columns(arrays(), most), blur=blur)
 
 
 def gathered_columns(parts: Iterable[Mapping[str, NDArray]], most: int) -> dict[str, NDArray]:

@@ -252,7 +252,7 @@ class Pointer:
         return Camera(
             self._views.normalization.viewmat(np.array(view.viewmat)),
             np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]),
-            max(round(factor * view.width), 1), max(round(factor * view.height), 1),
+            max(round(factor * view.width), 1), max(round(factor * view.height), 1), blur=self._views.blur,
         )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from ..capture import Capture
 from ..evaluation.images import as_bytes
 from ..model.object_model import Normalization
 from ..raster import Camera
+from ..shared.splats.blending import EPS_2D
 from .strokes import Viewpoint
 
 _SIZE = 400
@@ -33,6 +34,7 @@ class Views(NamedTuple):
         used: indices of the views by which splats are compared.
         normalization: transform between the capture's world and scene units.
         photo: returns the photo (H, W, 3) uint8 of a view by its index; None if there are none.
+        blur: variance of the low-pass filter with which the splats are drawn in other views.
     """
 
     names: Sequence[str]
@@ -40,6 +42,7 @@ class Views(NamedTuple):
     used: Sequence[int]
     normalization: Normalization
     photo: Callable[[int], np.ndarray] | None
+    blur: float = EPS_2D
 
     def reference(self, index: int) -> str | Viewpoint:
         """Return what a stroke in a view refers to: the name of the photo, or else the camera."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .settings import NEAR
+from .settings import EPS_2D, NEAR
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,8 @@ class Camera:
         K: (3, 3) float64, intrinsics in pixels; the center of the first pixel is (0.5, 0.5).
         width, height: size of the image in pixels.
         near: depth of the near plane in scene units.
+        blur: variance in square pixels of the low-pass filter with which 3D Gaussians are drawn, which is that of their
+            training.
         gain: per-channel brightness of the camera's photo relative to the scene; rendered images are multiplied by it.
         whole: for a crop, the bounds (left, top, right, bottom) of the uncropped image, in pixels from the upper left
             corner of the crop; None: not a crop.
@@ -28,6 +30,7 @@ class Camera:
     width: int
     height: int
     near: float = NEAR
+    blur: float = EPS_2D
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     whole: tuple[float, float, float, float] | None = None
 

@@ -14,7 +14,6 @@ from .camera import Camera
 from .settings import (
     ALPHA_MAX,
     ALPHA_MIN,
-    EPS_2D,
     EPS_2D_DISC,
     MAX_EXTENT,
     MIN_DISC_WIDTH,
@@ -167,7 +166,7 @@ def rasterize_reference(
         a, b, c, conditional = _footprints(p, axes, camera, 0.0, math.inf)
         broad = c * conditional > MIN_DISC_WIDTH**2 * (a + c)
     else:
-        a, b, c, conditional = _footprints(p, axes, camera, EPS_2D, TAN_MARGIN)
+        a, b, c, conditional = _footprints(p, axes, camera, camera.blur, TAN_MARGIN)
     extent2 = 2 * torch.log(opacities / ALPHA_MIN) * torch.maximum(a, c)
     directions = means - camera_center
     colors = sh_colors(sh, directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True))

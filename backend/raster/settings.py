@@ -9,6 +9,7 @@ from ..shared.splats.blending import (
     NEAR,
     TAN_MARGIN,
     TRANSMITTANCE_THRESHOLD,
+    USUAL_EPS_2D,
 )
 
 __all__ = [
@@ -20,13 +21,11 @@ __all__ = [
     "NEAR",
     "TAN_MARGIN",
     "TRANSMITTANCE_THRESHOLD",
+    "USUAL_EPS_2D",
 ]
 
 EPS_2D_DISC = 0.2
 """Variance in square pixels of the smallest footprint (spot) of a disc (low-pass filter of 2D Gaussian splatting)."""
-
-BLUR = {"3d": EPS_2D, "2d": EPS_2D_DISC}
-"""Variance in square pixels of the low-pass filter by primitive."""
 
 MIN_DISC_WIDTH = 0.05
 """Projected standard deviation in pixels below which only the spot of a disc is drawn, since such a thin line covers

@@ -35,7 +35,7 @@ from .discs import (
     disc_plane,
 )
 from .kernel import kernel
-from .settings import ALPHA_MIN, EPS_2D, MAX_EXTENT, MIN_QUAT_NORM2, TAN_MARGIN
+from .settings import ALPHA_MIN, MAX_EXTENT, MIN_QUAT_NORM2, TAN_MARGIN
 from .spherical_harmonics import sh_basis, sh_gradient
 
 # Columns of a screen splat.
@@ -81,7 +81,7 @@ def _jacobian(px, py, pz, fx, fy, tan_limits, T, W):
 
 
 @kernel()
-def _footprint(T, R, scales, n, V0, V1):
+def _footprint(T, R, scales, n, blur, V0, V1):
     """Compute V = T R diag(scales[n]) as its two rows; returns a, b, c of V V^T + blur and a - b^2 / c."""
     a = 0.0
     b = 0.0
@@ -98,8 +98,8 @@ def _footprint(T, R, scales, n, V0, V1):
     x = V0[1] * V1[2] - V0[2] * V1[1]
     y = V0[2] * V1[0] - V0[0] * V1[2]
     z = V0[0] * V1[1] - V0[1] * V1[0]
-    conditional = (x * x + y * y + z * z + EPS_2D * (a + c + EPS_2D)) / (c + EPS_2D)
-    return a + EPS_2D, b, c + EPS_2D, conditional
+    conditional = (x * x + y * y + z * z + blur * (a + c + blur)) / (c + blur)
+    return a + blur, b, c + blur, conditional
 
 
 @kernel()
@@ -122,15 +122,16 @@ def view_of(camera: Camera, flat: bool) -> np.ndarray:
         flat: whether the primitives are discs, whose projection is not clamped.
 
     Returns:
-        (6, 4) float64: three rows of the world-to-camera matrix; fx, fy, cx, cy; the limits of x/z and y/z; the
-        camera's position and near plane.
+        (7, 4) float64: three rows of the world-to-camera matrix; fx, fy, cx, cy; the limits of x/z and y/z; the
+        camera's position and near plane; the variance of the low-pass filter.
     """
     viewmat, intrinsics = camera.arrays()
     fx, fy, cx, cy = (float(v) for v in intrinsics)
     limits = tangent_limits(fx, fy, cx, cy, *camera.bounds)
     if flat:
         limits = np.array([-np.inf, np.inf, -np.inf, np.inf])
-    return np.concatenate([viewmat[:3], [intrinsics, limits, [*camera.center, camera.near]]])
+    others = [[*camera.center, camera.near], [camera.blur, 0.0, 0.0, 0.0]]
+    return np.concatenate([viewmat[:3], [intrinsics, limits, *others]])
 
 
 @kernel(inline=True)
@@ -172,7 +173,7 @@ def project_splat(
     middle_u, middle_v = u, v
     if tilts is None:
         _jacobian(px, py, pz, fx, fy, view[4], T, view)
-        a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+        a, b, c, conditional = _footprint(T, R, scales, n, view[6, 0], V0, V1)
         half_w = math.sqrt(reach * a / _HALF_LOG2E)
         half_h = math.sqrt(reach * c / _HALF_LOG2E)
         largest = max(half_w, half_h)
@@ -289,7 +290,7 @@ def project_splat_backward(
     _rotation(qw, qx, qy, qz, R)
     tx, ty = _jacobian(px, py, pz, fx, fy, view[4], T, view)
     if tilts is None:
-        _a, b, c, conditional = _footprint(T, R, scales, n, V0, V1)
+        _a, b, c, conditional = _footprint(T, R, scales, n, view[6, 0], V0, V1)
     else:
         _a, b, c, conditional, _area, broad = disc_footprint(T, R, scales, n, V0, V1)
         if not broad:

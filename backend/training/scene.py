@@ -16,6 +16,7 @@ from ..gpu.kernel import kernel
 from ..model.object_model import Normalization
 from ..raster import Camera, devices
 from ..shared.class_table import ClassTable
+from ..shared.splats.blending import EPS_2D
 from .exposure.gains import measure_gains, varies
 from .extent import SURROUNDINGS, Extent, extent_of
 
@@ -51,6 +52,7 @@ class Scene:
         device: device of the targets.
         gains: (V, 3), brightness of each image relative to the common exposure of the splats. None: estimated, or 1 if
             the exposure of the images does not vary (`exposure_varies`).
+        blur: variance of the low-pass filter with which the splats are drawn.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Scene:
         supervise_background: bool = False,
         device: torch.device = devices.CPU,
         gains: np.ndarray | None = None,
+        blur: float = EPS_2D,
     ) -> None:
         self.capture = capture
         self.classes = classes
@@ -74,6 +77,7 @@ class Scene:
             gains = gains if varies(gains) else np.ones_like(gains)
         self.exposure_varies = bool((gains != 1).any())
         self.gains = gains
+        self._blur = blur
         self._device = device
         self._budget = memory_mb * 1e6
         if device.type == "cuda":
@@ -93,6 +97,7 @@ class Scene:
             view.K,
             view.width,
             view.height,
+            blur=self._blur,
             gain=(float(self.gains[index, 0]), float(self.gains[index, 1]), float(self.gains[index, 2])),
         )
         return camera.reduced(downscale)

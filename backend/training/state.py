@@ -17,7 +17,7 @@ from ..model.heads import Heads
 from ..model.object_model import Normalization, ObjectModel
 from ..model.splats import gathered_columns
 from ..raster import devices
-from ..raster.settings import BLUR
+from ..raster.settings import EPS_2D, EPS_2D_DISC, USUAL_EPS_2D
 from ..shared.class_table import ClassTable
 from ..shared.errors import InputError
 from ..shared.formats.typed import typed
@@ -41,10 +41,10 @@ Expected = dict[str, tuple[type, tuple[int, ...]]]
 """Type and shape of tensors by name."""
 
 BLUR_KEY = "blur"
-"""Name of the low-pass filter's variance in a checkpoint's state; versions that did not write it used another one."""
+"""Name of the low-pass filter's variance in a checkpoint's state; former versions did not write it."""
 
 _OTHER_BLUR = (
-    "The model in {folder} was trained by a version that blurred splats more, so they appear too thin now; train it "
+    "The discs in {folder} were trained by a version that blurred them more, so they appear too thin now; train them "
     "further, or again, to adapt them."
 )
 
@@ -122,7 +122,7 @@ def training_state(
         "supervise_background": supervise_background,
         "normalization": {"center": model.normalization.center, "scale": model.normalization.scale},
         "rng": rng.bit_generator.state,
-        BLUR_KEY: BLUR[model.primitive],
+        BLUR_KEY: EPS_2D_DISC if model.primitive == "2d" else model.blur,
         "progress": {**p.__dict__},
         **({} if region.is_whole else {"region": region.as_dict()}),
     }
@@ -154,7 +154,7 @@ def model_from_checkpoint(tensors: dict[str, np.ndarray], state: dict[str, Any])
     normalization = Normalization((center[0], center[1], center[2]), scale)
     return ObjectModel(
         anchors, heads, torch.from_numpy(tensors["background"].copy()), ClassTable(tensors["object_ids"]),
-        normalization, settings.primitive,
+        normalization, settings.primitive, EPS_2D if settings.primitive == "2d" else state.get(BLUR_KEY, USUAL_EPS_2D),
     )  # fmt: skip
 
 
@@ -244,8 +244,8 @@ def load_model(
 
 
 def blur_warning(state: dict[str, Any], folder: Path) -> str | None:
-    """Return the warning about a checkpoint of a version with another low-pass filter, or None."""
-    if state.get(BLUR_KEY) == BLUR[Settings(**state["settings"]).primitive]:
+    """Return the warning about a checkpoint with discs of a version that filtered them otherwise, or None."""
+    if Settings(**state["settings"]).primitive != "2d" or state.get(BLUR_KEY) == EPS_2D_DISC:
         return None
     return _OTHER_BLUR.format(folder=folder)
 
@@ -312,6 +312,9 @@ def _check_state(settings: Settings, state: dict[str, Any]) -> None:
         raise ValueError("the normalization is invalid")
     if not (math.isfinite(state["voxel"]) and state["voxel"] > 0):
         raise ValueError("the voxel size is invalid")
+    blur = state.get(BLUR_KEY, USUAL_EPS_2D)
+    if isinstance(blur, bool) or not 0 < blur <= USUAL_EPS_2D:
+        raise ValueError("the low-pass filter is invalid")
     choices = {"mode": MODES, "primitive": ("3d", "2d"), "background": ("learned", "black", "white")}
     if any(getattr(settings, name) not in values for name, values in choices.items()):
         raise ValueError("a setting is unknown")

@@ -202,7 +202,7 @@ class Trainer:
         settings = Settings(**state["settings"])
         scene = Scene(
             capture, model.classes, model.normalization, settings.zero_is_object, memory_mb,
-            state["supervise_background"], device, gains,
+            state["supervise_background"], device, gains, model.blur,
         )  # fmt: skip
         rng = np.random.default_rng()
         rng.bit_generator.state = state["rng"]

@@ -251,7 +251,7 @@ def _objects(objs: Sequence[DrawnObject], view: View) -> np.ndarray:
         table[:, 3:6, 3] = np.einsum("nij,nj->ni", back, matrices[:, :3, 3] - camera_to_world[:, 3])
     table[:, 6:9] = [obj.recolor for obj in objs]
     table[:, 9] = [obj.color for obj in objs]
-    table[:, 10, :2] = [(obj.is_selected, obj.is_pointed_at) for obj in objs]
+    table[:, 10, :3] = [(obj.is_selected, obj.is_pointed_at, obj.splats.blur) for obj in objs]
     slots = [obj.slots for obj in objs]
     table = np.repeat(table, slots, axis=0)
     for first, obj in zip(np.cumsum([0, *slots]), objs):

@@ -11,7 +11,7 @@ import gpu
 from ...backend.shared.color import srgb
 from ...backend.shared.color.recolor import LUMA
 from ...backend.shared.splats import spherical_harmonics as sh
-from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, EPS_2D, MAX_EXTENT
+from ...backend.shared.splats.blending import ALPHA_MAX, ALPHA_MIN, MAX_EXTENT
 
 TABLE_WIDTH = 4096
 """Texels per row of data textures."""
@@ -21,8 +21,8 @@ SPLAT_TEXELS = 3
 
 OBJECT_TEXELS = 12
 """Texels per object: three rows each of the map to camera space, the map to view directions and the affine map of
-colors; the color with its opacity; the marks, 1 where the object is selected and where it is pointed at; one unused
-texel."""
+colors; the color with its opacity; the marks, 1 where the object is selected and where it is pointed at, and the
+variance of the low-pass filter; one unused texel."""
 
 INDEX_OFFSET = 1 << 24
 """Subtracted from the indices of splats in `order`: a float32 holds the integers up to this, also the negative ones."""
@@ -46,7 +46,6 @@ _CONSTANTS = f"""
 #define INDEX_OFFSET {INDEX_OFFSET}
 #define ALPHA_MAX {ALPHA_MAX!r}
 #define ALPHA_MIN {ALPHA_MIN!r}
-#define EPS_2D {EPS_2D!r}
 #define MAX_EXTENT {MAX_EXTENT!r}
 #define SELECTED_COLOR vec3{SELECTED_COLOR!r}
 #define SELECTED_AMOUNT {SELECTED_AMOUNT!r}
@@ -137,9 +136,11 @@ void main() {
     float b = dot(first, second);
     float c = dot(second, second);
     vec3 area = cross(first, second);
-    float across2 = (dot(area, area) + EPS_2D * (a + c + EPS_2D)) / (c + EPS_2D);
-    a += EPS_2D;
-    c += EPS_2D;
+    vec3 marks_blur = at(objects, object + 10).xyz;
+    float blur = marks_blur.z;
+    float across2 = (dot(area, area) + blur * (a + c + blur)) / (c + blur);
+    a += blur;
+    c += blur;
     vec2 extent = sqrt(2.0 * log(opacity / ALPHA_MIN) * vec2(a, c));
     if (!(max(extent.x, extent.y) < MAX_EXTENT)) {
         return;
@@ -155,7 +156,7 @@ void main() {
     // Keeps the brightness, so that shapes remain visible.
     float shade = 0.5 + dot(color, LUMA);
     color = mix(color, own.rgb * shade, own.a);
-    mark = at(objects, object + 10).xy;
+    mark = marks_blur.xy;
     color = mix(color, SELECTED_COLOR, fract(entry.y) > 0.1 ? SELECTED_AMOUNT : 0.0);
 
     beside = corner * extent;

@@ -15,6 +15,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...backend.shared.splats.blending import EPS_2D
 from ...backend.shared.splats.picking import Cloud
 from .. import scene
 from ..scene import carrier
@@ -31,6 +32,7 @@ class SplatArrays:
         opacities: (N,).
         harmonics: (N, K, 3) spherical harmonics coefficients for red, green and blue.
         vertices: (N,) indices of the splats among the vertices of the carrier; None if all are visible.
+        blur: variance in square pixels of the low-pass filter with which they are drawn.
     """
 
     means: np.ndarray
@@ -39,6 +41,7 @@ class SplatArrays:
     opacities: np.ndarray
     harmonics: np.ndarray
     vertices: np.ndarray | None = None
+    blur: float = EPS_2D
 
     def is_same(self, other: SplatArrays) -> bool:
         """Return whether these are the same splats."""
@@ -48,7 +51,7 @@ class SplatArrays:
     @cached_property
     def cloud(self) -> Cloud:
         """The splats in the form required for picking."""
-        return Cloud(self.means, self.quats, self.scales, self.opacities)
+        return Cloud(self.means, self.quats, self.scales, self.opacities, self.blur)
 
 
 @dataclass(frozen=True)
@@ -158,10 +161,10 @@ def _read(mesh: bpy.types.Mesh) -> SplatArrays:
         np.ascontiguousarray(base[:, 3]),
         np.stack(coefficients, axis=1),
     )
-    hidden = scene.hidden_splats(mesh)
+    hidden, blur = scene.hidden_splats(mesh), scene.blur_of(mesh)
     if hidden is None:
-        return SplatArrays(*arrays)
-    return SplatArrays(*(values[~hidden] for values in arrays), vertices=np.flatnonzero(~hidden))
+        return SplatArrays(*arrays, blur=blur)
+    return SplatArrays(*(values[~hidden] for values in arrays), vertices=np.flatnonzero(~hidden), blur=blur)
 
 
 def _forget(*_: Any) -> None:

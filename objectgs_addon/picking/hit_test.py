@@ -135,7 +135,7 @@ def _without_floaters(mesh: bpy.types.Mesh, arrays: SplatArrays) -> Cloud:
     if not floating.any():
         return arrays.cloud
     kept = (values[~floating] for values in (arrays.means, arrays.quats, arrays.scales, arrays.opacities))
-    return Cloud(*kept)
+    return Cloud(*kept, arrays.blur)
 
 
 def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:

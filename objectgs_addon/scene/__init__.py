@@ -7,7 +7,7 @@ from .carrier import require_object_mode
 from .edits.crop_box import add_crop_box, box_of, crop_box_of
 from .edits.duplicates import duplicate, remove_duplicate
 from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
-from .edits.floaters import floater_counts, floating_splats, hidden_splats
+from .edits.floaters import floater_counts, floating_splats, hidden_splats, update_floaters
 from .edits.placement import distance_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
 from .edits.show import Places, is_removed, places_of, recolor, reset_placement, show_edits, store_placements
@@ -54,7 +54,7 @@ from .points import color_points_by, point_numbers, shown_points
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.materials import SHADINGS
 from .shading.render_settings import camera_problem, is_untouched, prepare_render, render_problem, set_up_render
-from .splats import splat_keys
+from .splats import blur_of, splat_keys
 from .uncertain_cameras import uncertain_cameras
 
 __all__ = [
@@ -67,6 +67,7 @@ __all__ = [
     "ShownEdits",
     "ShownMeshes",
     "add_crop_box",
+    "blur_of",
     "bounds",
     "box_of",
     "camera_problem",
@@ -138,6 +139,7 @@ __all__ = [
     "to_stored",
     "uncertain_cameras",
     "unobserved_splats",
+    "update_floaters",
     "use_camera",
     "warnings_of",
     "with_own_textures",

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...backend.shared.color.palette import to_linear
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.splat_ply import ids_of
+from ...backend.shared.formats.splat_ply import ids_of, read_blur
 from ...backend.shared.reconstruction.edits.splat_edits import missing_sentence, read_splat_edits
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
@@ -54,6 +54,7 @@ from .shading.materials import splats_material
 from .shading.modifiers import add_splats_modifiers, update_groups, use_material
 from .shading.node_groups import HIDDEN
 from .splats import (
+    BLUR,
     anchor_attributes,
     median_scale,
     positions_of,
@@ -99,6 +100,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     """
     folder = Path(folder)
     splats, warnings = read_splats(folder)
+    blur = read_blur(Reconstruction(folder).splats)
     anchors, more = read_anchors(folder)
     objects = Objects.read(folder)
     edits = read_splat_edits(Reconstruction(folder))
@@ -130,6 +132,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
         if HIDDEN in attributes:
             update_groups(obj)
         carrier.fill(obj.data, positions - center_of(pivot), attributes)
+        obj.data[BLUR] = blur
         select_splats(obj.data, np.isin(keys_of(obj.data), selected))
         mark_floaters(obj, positions)
         mark_distant(root, obj, positions)

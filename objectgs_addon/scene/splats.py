@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 
 from ...backend.shared.errors import InputError
@@ -22,8 +23,12 @@ from ...backend.shared.formats.splat_ply import (
     shown_rows,
 )
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.splats.blending import LEAST_EPS_2D, USUAL_EPS_2D
 from .carrier import stored_ids
 from .edits.single_splats import table_keys
+
+BLUR = "objectgs_low_pass"
+"""Custom property of the mesh of a carrier of splats: the variance of their low-pass filter."""
 
 LARGEST_TABLE = 1 << 22
 """IDs below this limit are grouped by counting instead of sorting."""
@@ -39,6 +44,12 @@ def read_splats(folder: Path) -> tuple[np.ndarray, list[str]]:
     if not path.is_file():
         raise InputError(f"{folder} has no splats.ply; train first.")
     return _without_unusable(read_splat_table(path), REQUIRED, path.name, "splats")
+
+
+def blur_of(mesh: bpy.types.Mesh) -> float:
+    """Return the variance in square pixels of the low-pass filter with which the splats of a carrier are drawn."""
+    blur = mesh.get(BLUR)
+    return blur if isinstance(blur, float) and LEAST_EPS_2D <= blur <= USUAL_EPS_2D else USUAL_EPS_2D
 
 
 def splat_keys(folder: Path) -> np.ndarray:

@@ -58,6 +58,7 @@ def delete(root: bpy.types.Collection, parts: Sequence[bpy.types.Object]) -> int
         selected = scene.selected_splats(mesh)
         if selected.any():
             scene.delete_splats(part, selected)
+            scene.update_floaters(part)
             drawing.splats_changed(mesh)
     scene.remember_edits(root, changed, scene.shown_edits(root).missing)
     _followed[root.session_uid] = digest_of(changed)

@@ -84,7 +84,9 @@ def test_parts_are_all_splats(monkeypatch, primitive):
         assert np.array_equal(np.concatenate([part.source for part in parts]), source)
         of_chosen, none = made.of(chosen), made.of(chosen[:0])
         assert np.array_equal(of_chosen.source, source[expected]) and len(none.splats) == len(none.source) == 0
-        for name, values in vars(splats).items():
+        assert {part.splats.blur for part in parts} == {splats.blur}
+        arrays = {name: values for name, values in vars(splats).items() if name != "blur"}
+        for name, values in arrays.items():
             found = np.concatenate([getattr(part.splats, name) for part in parts])
             np.testing.assert_array_equal(found, values, name)
             np.testing.assert_array_equal(getattr(of_chosen.splats, name), values[expected], name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import OpenEXR
@@ -113,7 +114,7 @@ def reference(splats: Splats, at: Sample, primitive="3d") -> tuple[np.ndarray, .
     slots = np.searchsorted(IDS, splats.object_ids)
     arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = [torch.tensor(np.asarray(values, np.float64)) for values in arrays]
-    camera = Camera(at.viewmat, at.K, WIDTH, HEIGHT, near=at.clip[0])
+    camera = Camera(at.viewmat, at.K, WIDTH, HEIGHT, near=at.clip[0], blur=splats.blur)
     drawn = rasterize_reference(*tensors, torch.tensor(slots), camera, len(IDS), primitive)
     color, alpha = drawn.color.numpy(), drawn.alpha.numpy()
     straight = np.moveaxis(color / np.maximum(alpha, 1e-12), 0, -1)
@@ -151,12 +152,14 @@ def assert_same(planes, splats, at, primitive="3d") -> None:
     assert np.array_equal(planes["IndexOB.X"][clear], winner[clear])
 
 
-@pytest.mark.parametrize("primitive", ["3d", "2d"])
-def test_frame_matches_reference(folder, film, primitive):
+@pytest.mark.parametrize(("primitive", "blur"), [("3d", 0.05), ("3d", 0.3), ("2d", 0.05)])
+def test_frame_matches_reference(folder, film, primitive, blur):
+    write_splats(folder.splats, replace(some_splats(), blur=blur))
     votes = VotesRecord("majority", None, 1600, "0f", None)
     update_record(folder, training=TrainingRecord({"primitive": primitive}, votes))
     planes = film(shot_of([sample()]), "--png")[0]
     splats, _ = read_splats(folder.splats)
+    assert splats.blur == blur
     assert_same(planes, splats, sample(), primitive)
     rgba = rgba_of(planes)
     photo = np.asarray(Image.open(frame_path(folder.folder.parent / "film", 1).with_suffix(".png")))

@@ -14,6 +14,7 @@ from backend.model.splats import Splats
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.reconstruction.folder import Reconstruction
 from backend.shared.reconstruction.objects import read_objects, write_objects
+from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 from backend.shared.splats.spherical_harmonics import C0
 
 from .command_result import assert_rejected
@@ -116,6 +117,7 @@ def test_import_restores_what_export_wrote(run_command, folder, tmp_path, kind):
     result = run_command("import-splats", tmp_path / f"all.{kind}", "--out", made.folder, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["splats"] == 60 and result.events[-1]["objects"] == 0
     found, wanted = read_splats(made.splats)[0], read_splats(folder.splats)[0]
+    assert found.blur == USUAL_EPS_2D and wanted.blur == EPS_2D
     order, others = np.lexsort(np.round(found.means, 3).T), np.lexsort(np.round(wanted.means, 3).T)
     found, wanted = found.select(order), wanted.select(others)
     np.testing.assert_allclose(found.means, wanted.means, atol=1e-4)

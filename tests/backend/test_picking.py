@@ -24,10 +24,10 @@ def splats(count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
     return means, rng.normal(size=(count, 4)), scales, rng.uniform(0.0, 1.0, count), ids
 
 
-def objects_of(means, quats, scales, opacities, ids, matrix=None) -> list[PickObject]:
+def objects_of(means, quats, scales, opacities, ids, matrix=None, blur=0.05) -> list[PickObject]:
     matrix = np.eye(4) if matrix is None else matrix
     return [
-        PickObject(int(i), Cloud(means[ids == i], quats[ids == i], scales[ids == i], opacities[ids == i]), matrix)
+        PickObject(int(i), Cloud(*(of[ids == i] for of in (means, quats, scales, opacities)), blur), matrix)
         for i in np.unique(ids)
     ]
 
@@ -38,13 +38,13 @@ def view(distance: float = 3.0, **options) -> View:
     return View(turned, 55.0, 60.0, 30.0, 26.0, *SIZE, **options)
 
 
-def drawn(view: View, means, quats, scales, opacities, ids) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def drawn(view: View, means, quats, scales, opacities, ids, blur=0.05) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the renderer's IDs (-1: nothing), their probability, and alpha."""
     K = np.array([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1.0]])
     tensors = [torch.from_numpy(np.asarray(a, np.float32)) for a in (means, quats, scales, opacities)]
     sh = torch.zeros(len(means), 1, 3)
     rendered = rasterize(
-        *tensors, sh, torch.from_numpy(ids.astype(np.int32)), Camera(view.viewmat, K, *SIZE, near=view.near)
+        *tensors, sh, torch.from_numpy(ids.astype(np.int32)), Camera(view.viewmat, K, *SIZE, view.near, blur)
     )
     found, probability = object_map(rendered)
     return found, probability, rendered.alpha.numpy()
@@ -65,14 +65,14 @@ def assert_agrees(objects: list[PickObject], view: View, ids: np.ndarray, probab
     assert compared > 300
 
 
-@pytest.mark.parametrize("distance", [3.0, 0.4])
-def test_pick_matches_renderer(distance):
+@pytest.mark.parametrize(("distance", "blur"), [(3.0, 0.05), (0.4, 0.05), (3.0, 0.3)])
+def test_pick_matches_renderer(distance, blur):
     """From outside and from inside the scene, where many splats are behind the camera or huge."""
     given = splats(600)
     seen = view(distance)
-    ids, probability, _ = drawn(seen, *given)
+    ids, probability, _ = drawn(seen, *given, blur)
     assert (ids >= 0).mean() > 0.3
-    assert_agrees(objects_of(*given), seen, ids, probability)
+    assert_agrees(objects_of(*given, blur=blur), seen, ids, probability)
 
 
 def test_transformed_object_is_picked():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from backend.export import read_splats, write_splat_parts, write_splats
 from backend.model.splats import Splats, concatenate
 from backend.shared.errors import InputError
 from backend.shared.formats.ply import read_vertices, write_vertices
+from backend.shared.splats.blending import USUAL_EPS_2D
 
 
 def some_splats(n=5, degree=1, seed=0, dtype=np.float32):
@@ -75,7 +77,7 @@ def test_single_splat_has_expected_bytes(tmp_path):
     assert write_splats(tmp_path / "splats.ply", splats) == []
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"] + [f"f_rest_{i}" for i in range(9)]
     names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    header = "ply\nformat binary_little_endian 1.0\ncomment low_pass 0.05\nelement vertex 1\n"
     header += "".join(f"property float {name}\n" for name in names) + "property uint object_id\nend_header\n"
     rest = [3, 6, 9, 4, 7, 10, 5, 8, 11]
     values = [1, 2, 3, 0, 0, 0, 0, 1, 2, *rest, 0, 0, 1, 2, 0.5, -0.5, 0.5, 0.5]
@@ -222,6 +224,15 @@ def test_foreign_property_order_and_endianness_are_read(tmp_path, order):
     assert splats.opacities[0] == 0.5
     assert splats.sh[0, 0] == pytest.approx([0.1, 0.2, 0.3])
     assert splats.object_ids.tolist() == [0, 0]
+    assert splats.blur == USUAL_EPS_2D
+
+
+@pytest.mark.parametrize(("comment", "blur"), [("0.1", 0.1), ("wide", 0.3), ("-1", 0.3), ("nan", 0.3), ("", 0.3)])
+def test_filter_is_that_of_the_file(tmp_path, comment, blur):
+    path = tmp_path / "a.ply"
+    write_splats(path, replace(some_splats(n=3), blur=0.05))
+    path.write_bytes(path.read_bytes().replace(b"low_pass 0.05", f"low_pass {comment}".encode()))
+    assert read_splats(path)[0].select([0, 2]).with_degree(0).blur == blur
 
 
 def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):

@@ -1,5 +1,7 @@
 """The kernels against the float64 reference: CPU kernels here, GPU kernels in test_gpu_kernels.py and tests/gpu."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -144,6 +146,12 @@ PRIMITIVES = pytest.mark.parametrize("primitive", ["3d", "2d"])
 )
 def test_random_scenes_match_reference(seed, coefficients, primitive):
     compare(random_scene(seed, coefficients=coefficients), camera(), seed=seed, primitive=primitive)
+
+
+def test_filter_of_other_programs_matches_reference():
+    scene, wider = random_scene(0, size=0.01), replace(camera(), blur=0.3)
+    got, _ = compare(scene, wider)
+    assert not torch.allclose(got.alpha, rasterize(**as_float32(scene), camera=camera()).alpha, atol=0.1)
 
 
 def test_median_depth_is_at_half_transmittance():

@@ -27,6 +27,7 @@ from backend.raster import Camera, rasterize
 from backend.shared.class_table import ClassTable
 from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
+from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 from backend.shared.stopping import StopRequest
 from backend.training.budget import Budget
 from backend.training.cells.region import EVERYWHERE, Region
@@ -37,7 +38,7 @@ from backend.training.optimizer.adam import BETA1, BETA2, step_rows
 from backend.training.optimizer.average import EVERY, FRACTION, MAX_STEPS, Average
 from backend.training.scene import Scene
 from backend.training.settings import Settings
-from backend.training.state import load_model
+from backend.training.state import blur_warning, load_model
 from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -297,16 +298,19 @@ def test_nonfinite_gradient_affects_only_its_anchor():
     assert found[[i for i in range(n) if i != at_fault]].isfinite().all()
 
 
-def test_anchors_in_view_include_all_drawn_anchors():
+@pytest.mark.parametrize(("extent", "blur"), [(-2, 0.05), (-7, 0.3)])
+def test_anchors_in_view_include_all_drawn_anchors(extent, blur):
+    """Also opaque points, which are drawn as wide as the low-pass filter."""
     rng = np.random.default_rng(5)
     layout = Layout(4, 8)
     n = 400
     rows = torch.tensor(rng.normal(0, 0.5, (n, layout.columns)), dtype=torch.float32)
-    rows[:, layout.extent_columns] = torch.tensor(rng.normal(-2, 0.7, (n, 6)), dtype=torch.float32)
+    rows[:, layout.extent_columns] = torch.tensor(rng.normal(extent, 0.7, (n, 6)), dtype=torch.float32)
+    rows[:, layout.opacity_columns] = 6.0
     positions = torch.tensor(rng.normal(0, 3, (n, 3)), dtype=torch.float32)
     anchors = Anchors(layout, 0.1, positions, rows, torch.zeros(n, dtype=torch.int32))
     heads = Heads(layout, "explicit", 0, torch.Generator().manual_seed(1))
-    camera = Camera(np.eye(4), np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]]), 64, 48)
+    camera = Camera(np.eye(4), np.array([[50.0, 0, 30], [0, 60, 20], [0, 0, 1]]), 64, 48, blur=blur)
     with torch.no_grad():
         g = generate(layout, positions, rows, anchors.ids, heads)
         drawn = rasterize(*g[:6], camera)
@@ -557,6 +561,20 @@ def test_checkpoint_of_3d_gaussians_ignores_disc_settings(tiny, tmp_path):
         Trainer.resume(capture, tmp_path, FLAT)
 
 
+def test_older_checkpoint_keeps_its_filter(tiny, tmp_path):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    trainer.run(Budget(steps=2), tmp_path, Reporter())
+    assert trainer.scene.camera(0).blur == load_model(tmp_path)[0].blur == EPS_2D
+    tensors, state, _ = load_checkpoint(tmp_path)
+    save_checkpoint(tmp_path, tensors, {k: v for k, v in state.items() if k not in ("format", "blur")})
+    trainer, _ = Trainer.resume(capture, tmp_path, SMALL)
+    trainer.run(Budget(steps=4), tmp_path, Reporter())
+    assert trainer.scene.camera(0, downscale=2).blur == USUAL_EPS_2D
+    model = load_model(tmp_path)[0]
+    assert model.blur == model.splats()[0].blur == USUAL_EPS_2D and model.splats()[0].select([0]).blur == USUAL_EPS_2D
+
+
 def test_older_checkpoint_is_3d(tiny, tmp_path):
     capture, ids = tiny()
     Trainer.start(capture, ids, SMALL).run(Budget(steps=2), tmp_path, Reporter())
@@ -565,7 +583,7 @@ def test_older_checkpoint_is_3d(tiny, tmp_path):
         del state["settings"][name]
     save_checkpoint(tmp_path, tensors, {k: v for k, v in state.items() if k != "format"})
     trainer, _ = Trainer.resume(capture, tmp_path, SMALL)
-    assert trainer.model.primitive == "3d"
+    assert trainer.model.primitive == "3d" and blur_warning(state, tmp_path) is None
 
 
 def test_normals_and_distortion_are_computed_only_if_weighted(tiny, monkeypatch):

@@ -153,6 +153,22 @@ def test_undo_restores_floaters(root):
     assert cleaned(root) == [1] and hidden(root) == 3
 
 
+def test_deleted_splats_do_not_keep_others_from_floating(root):
+    """The backend leaves them out, too, before it looks for floaters."""
+    mesh = part(root).data
+    positions = np.array([vertex.co for vertex in mesh.vertices])
+    before, deleted = blender_scene.floating_splats(mesh), np.arange(len(positions)) < 295
+    for attempt in range(2):
+        if attempt == 0:
+            blender_scene.select_splats(mesh, deleted)
+            assert bpy.ops.objectgs.delete_splats() == {"FINISHED"}
+        else:
+            blender_scene.show_result(root, blender_scene.folder_of(root))
+        found = blender_scene.floating_splats(mesh)
+        assert not found[deleted].any() and not np.array_equal(found, before & ~deleted)
+        assert np.array_equal(found[~deleted], floating(positions[~deleted]))
+
+
 def test_edits_from_the_command_line_are_shown(root):
     edit_objects(blender_scene.folder_of(root) / "objects.json", {1: {"cleaned": True}})
     assert bpy.ops.objectgs.show_result() == {"FINISHED"}

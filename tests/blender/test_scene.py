@@ -397,6 +397,13 @@ def test_result_of_different_size_replaces_previous_one(root, folder):
     assert len(kinds.part_of(blender_scene.object_collections(root)[1], "splats").data.materials) == 1
 
 
+def test_splats_have_the_filter_of_their_file(root, folder):
+    for comments, blur in ((["low_pass 0.05"], 0.05), ([], 0.3)):
+        write_vertices(folder / "splats.ply", splat_table(np.resize([1], 10)), comments)
+        again(root, folder)
+        assert blender_scene.blur_of(part(root, 1, "splats").data) == pytest.approx(blur)
+
+
 def test_vanished_objects_are_removed_and_user_objects_kept(root, folder):
     cube = bpy.data.objects.new("cube", bpy.data.meshes.new("cube"))
     blender_scene.object_collections(root)[2].objects.link(cube)

@@ -5,6 +5,7 @@ import json
 import math
 import textwrap
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -216,6 +217,18 @@ def test_drawing_matches_backend_image(window):
             part.hide_set(False)
     """)
     )
+
+
+def test_drawing_blurs_as_the_file_says(window, folder):
+    """As other programs do, for which these splats were trained."""
+    images, wanted = {}, {}
+    for blur in (0.3, 0.05):
+        write_splats(folder / "splats.ply", replace(splats(), blur=blur))
+        window.run(script(f"scene.show_result(root, Path({str(folder)!r}))"))
+        images[blur] = drawn(window)
+        wanted[blur] = backend_draws(camera=Camera(viewmat(), np.array(K), *SIZE, blur=blur))
+    for blur, other in ((0.3, 0.05), (0.05, 0.3)):
+        assert psnr(images[blur], wanted[blur]) > 40.0 > psnr(images[blur], wanted[other])
 
 
 def test_orthographic_drawing_matches_distant_camera(window):

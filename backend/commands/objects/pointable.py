@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -111,7 +112,7 @@ def _of_training(trained: Trained) -> Pointable:
     # In the same parts as the file was written in, whose rounding may depend on them.
     written = np.concatenate([part.source for part in ExactSplats(model).parts()])
     in_file = np.isin(devices.host(splats.source), written)
-    views = views_of_photos(trained.capture, scene.camera, scene.normalization)
+    views = views_of_photos(trained.capture, scene.camera, scene.normalization)._replace(blur=model.blur)
     return Pointable(trained.folder, trained, splats, in_file, model.primitive, views, trained.capture)
 
 
@@ -134,6 +135,7 @@ def _of_splats(folder: Reconstruction, options: argparse.Namespace, reporter: Re
         views = views_around(normalization.to_scene(splats.means), read_upright(folder).rotation[2], normalization)
     else:
         views = _views_of(capture, normalization)
+    views = views._replace(camera=_filtered(views.camera, splats.blur), blur=splats.blur)
     generated = _in_scene_units(splats, normalization, choose_device(options.device, reporter))
     return Pointable(folder, splats, generated, np.ones(len(splats), bool), "3d", views, capture)
 
@@ -178,6 +180,11 @@ def _views_of(capture: Capture, normalization: Normalization) -> Views:
         return Camera(normalization.viewmat(view.viewmat), view.K, view.width, view.height)
 
     return views_of_photos(capture, camera, normalization)
+
+
+def _filtered(camera: Callable[[int], Camera], blur: float) -> Callable[[int], Camera]:
+    """Return the same cameras with another low-pass filter."""
+    return lambda index: replace(camera(index), blur=blur)
 
 
 def _in_scene_units(splats: Splats, normalization: Normalization, device: torch.device) -> Generated:

@@ -1,8 +1,9 @@
 """Splats as PLY in the layout of 3D Gaussian splatting: names, order, types and limits of the properties.
 
 Opacities are logits and scales are logarithms. `f_rest` has all red coefficients first, then green, then blue. Two
-properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar. A
-comment `background R G B` in the header has the color behind the splats, in display space from 0 to 1.
+properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar. Two
+comments in the header, too: `background R G B`, the color behind the splats, in display space from 0 to 1, and
+`low_pass V`, the variance in square pixels of the filter with which they are to be drawn.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import numpy as np
 
 from ..class_table import LARGEST_ID
 from ..errors import InputError
-from .ply import read_vertices
+from ..splats.blending import LEAST_EPS_2D, USUAL_EPS_2D
+from .ply import read_comments, read_vertices
 
 MEANS = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
@@ -36,6 +38,7 @@ LARGEST_SHOWN_LOG_SCALE = 80.0
 
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _REST = "f_rest_"
+_BLUR = "low_pass"
 REQUIRED = (*MEANS, *_DC, OPACITY, *SCALES, *QUATS)
 _ROWS_AT_ONCE = 1 << 14
 """Number of rows checked at a time, small enough to stay in the CPU cache."""
@@ -56,6 +59,28 @@ def sh_names(coefficients: int) -> list[tuple[str, str, str]]:
 def background_comment(color: Sequence[float]) -> str:
     """Return the comment of the header with the color behind the splats."""
     return "background " + " ".join(f"{value:.4f}" for value in color)
+
+
+def blur_comment(variance: float) -> str:
+    """Return the comment of the header with the low-pass filter of the splats."""
+    return f"{_BLUR} {variance:g}"
+
+
+def read_blur(path: Path) -> float:
+    """Return the variance of the low-pass filter of splats that `read_splat_table` has read.
+
+    It is that of 3D Gaussian splatting if the file does not say.
+    """
+    for comment in read_comments(path):
+        name, _, value = comment.partition(" ")
+        if name == _BLUR:
+            try:
+                blur = float(value)
+            except ValueError:
+                continue
+            if LEAST_EPS_2D <= blur <= USUAL_EPS_2D:
+                return blur
+    return USUAL_EPS_2D
 
 
 def splat_dtype(names: Iterable[str], position: str = "f4") -> np.dtype:

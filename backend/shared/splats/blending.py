@@ -12,12 +12,15 @@ no combination of ALPHA_MAX and the threshold can make an opaque splat disappear
 (1 - ALPHA_MAX)^2, so that rounding does not decide whether a third splat is visible behind two opaque ones."""
 
 EPS_2D = 0.05
-"""Variance in square pixels added to every splat's footprint (low-pass filter of 3D Gaussian splatting).
+"""Variance in square pixels added to the footprint of a splat of this program's models (low-pass filter).
 
-It is about the least with which a small opaque splat is drawn at one pixel center at least, wherever it is. The usual
-0.3 blurs edges that are sharp in photos, and splats trained with it are too thick in smaller images, too thin in larger
-ones.
+It is about the least with which a small opaque splat is drawn at one pixel center at least, wherever it is.
 """
+
+LEAST_EPS_2D, USUAL_EPS_2D = 1e-3, 0.3
+"""The smallest that files may have, and that of 3D Gaussian splatting (Kerbl et al. 2023), with which splats of other
+programs are trained, and with which they have to be drawn. The latter blurs edges that are sharp in photos, and splats
+trained with it are too thick in smaller images, too thin in larger ones."""
 
 MAX_EXTENT = 1e9
 """Splats that extend farther than this from their center, in pixels, are not drawn: their scale has diverged."""

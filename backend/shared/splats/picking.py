@@ -25,12 +25,13 @@ from .blending import (
     NEAR,
     TAN_MARGIN,
     TRANSMITTANCE_THRESHOLD,
+    USUAL_EPS_2D,
 )
 
 BLOCK = 16
 """Splats in a block."""
 
-_BLUR_REACH = math.sqrt(2.0 * math.log(1.0 / ALPHA_MIN) * EPS_2D)
+_BLUR_REACH = math.sqrt(2.0 * math.log(1.0 / ALPHA_MIN) * USUAL_EPS_2D)
 """Largest distance in pixels by which the low-pass filter extends a splat."""
 
 _GRID = 16
@@ -49,9 +50,13 @@ class Cloud:
         quats: rotations (N, 4) wxyz of any length.
         scales: standard deviations (N, 3), linear.
         opacities: (N,) in 0 .. 1. Splats that no renderer draws are left out.
+        blur: variance in square pixels of the low-pass filter with which they are drawn, at most USUAL_EPS_2D.
     """
 
-    def __init__(self, means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray) -> None:
+    def __init__(
+        self, means: NDArray, quats: NDArray, scales: NDArray, opacities: NDArray, blur: float = EPS_2D
+    ) -> None:
+        self.blur = blur
         opacities = np.asarray(opacities, np.float64)
         quats = np.asarray(quats, np.float64)
         norms2 = np.einsum("ij,ij->i", quats, quats)
@@ -343,14 +348,15 @@ def _project(cloud: Cloud, to_camera: NDArray, stretch: float, view: View, recta
         second = view.fy / z * (axes[:, 1] - slopes[:, 1:] * axes[:, 2])
     a, b, c = (np.einsum("ij,ij->i", *pair) for pair in ((first, first), (first, second), (second, second)))
     area = np.cross(first, second)
-    across2 = (np.einsum("ij,ij->i", area, area) + EPS_2D * (a + c + EPS_2D)) / (c + EPS_2D)
+    across2 = (np.einsum("ij,ij->i", area, area) + cloud.blur * (a + c + cloud.blur)) / (c + cloud.blur)
+    a, c = a + cloud.blur, c + cloud.blur
     opacity = cloud.opacities[index].astype(np.float64)
     reach2 = 2.0 * np.log(opacity / ALPHA_MIN)
-    half = np.sqrt(reach2[:, None] * np.stack([a + EPS_2D, c + EPS_2D], 1))
+    half = np.sqrt(reach2[:, None] * np.stack([a, c], 1))
     center = view.pixels(centers)
     left, top, right, bottom = rectangle
     kept = ((center + half >= (left, top)) & (center - half <= (right, bottom))).all(1) & (half.max(1) < MAX_EXTENT)
-    columns = (center, half, b / (c + EPS_2D), across2, c + EPS_2D, opacity, centers[:, 2])
+    columns = (center, half, b / c, across2, c, opacity, centers[:, 2])
     return tuple(column[kept] for column in columns)
 
 

@@ -19,7 +19,7 @@ from ...model.splats import gathered_columns
 from ...raster import Camera
 from ..budget import TrainingProgress
 from ..settings import Settings
-from ..state import BLUR_KEY, Keep
+from ..state import Keep
 from ..step import frustum
 from .division import NO_CELL, Division
 from .region import Bounds, Region, inside
@@ -161,7 +161,7 @@ def merged(
         # Anchors whose parameters were not finite have been removed.
         anchors = {name: np.concatenate([anchors[name][~of_seams], trained[name]]) for name in _OF_ANCHORS}
     made = _untrained(tensors, anchors, 0, Settings(**state["settings"]))
-    return made, {**state, BLUR_KEY: seams[1].get(BLUR_KEY), "progress": {**progress.__dict__}, MERGED_OF: key}
+    return made, {**state, "progress": {**progress.__dict__}, MERGED_OF: key}
 
 
 def _untrained(

@@ -17,7 +17,7 @@ import numpy as np
 from ...model.discs import to_discs
 from ...model.object_model import ObjectModel
 from ...raster import devices
-from ...raster.settings import BLUR
+from ...raster.settings import EPS_2D_DISC
 from ..budget import Budget
 from ..scene import Scene
 from ..settings import Settings
@@ -41,7 +41,7 @@ def budget_of_discs(trained_steps: int) -> Budget:
 
 def digest_of_model(model: ObjectModel) -> str:
     """Return a digest of a model's parameters, and of how discs are drawn."""
-    digest = hashlib.sha256(str(BLUR["2d"]).encode())
+    digest = hashlib.sha256(str(EPS_2D_DISC).encode())
     tensors = (model.anchors.positions, model.anchors.rows, model.anchors.ids, *model.heads.state_dict().values())
     for tensor in tensors:
         digest.update(devices.host(tensor.detach()).tobytes())

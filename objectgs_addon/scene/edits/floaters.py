@@ -52,10 +52,28 @@ def mark_floaters(obj: bpy.types.Object, positions: np.ndarray) -> None:
         obj: the carrier.
         positions: (n, 3) float64 positions of its splats, in any coordinates.
     """
-    found = floating(positions)
+    kept = ~deleted_splats(obj.data)
+    found = np.zeros(len(positions), bool)
+    found[kept] = floating(positions[kept])
     if found.any():
         update_groups(obj)
     carrier.write(obj.data, FLOATING, "BOOLEAN", found)
+
+
+def update_floaters(obj: bpy.types.Object) -> None:
+    """Find the floaters of a carrier again after some of its splats were deleted."""
+    found = _found(obj.data)
+    if found.any():
+        update_groups(obj)
+    carrier.write(obj.data, FLOATING, "BOOLEAN", found)
+
+
+def _found(mesh: bpy.types.Mesh) -> np.ndarray:
+    """Return which captured splats of a carrier float among those that are not deleted, (n,) bool."""
+    captured = np.flatnonzero(~unobserved_splats(mesh) & ~deleted_splats(mesh))
+    found = np.zeros(len(mesh.vertices), bool)
+    found[captured] = floating(carrier.read(mesh, "position")[captured].astype(np.float64))
+    return found
 
 
 def mark_distant(root: bpy.types.Collection, obj: bpy.types.Object, positions: np.ndarray) -> None:
@@ -79,11 +97,7 @@ def floating_splats(mesh: bpy.types.Mesh) -> np.ndarray:
     """Return an (n,) bool mask of a carrier's floaters, hidden or not."""
     if FLOATING in mesh.attributes:
         return carrier.read(mesh, FLOATING)
-    # The carrier is of an older version.
-    captured = np.flatnonzero(~unobserved_splats(mesh))
-    found = np.zeros(len(mesh.vertices), bool)
-    found[captured] = floating(carrier.read(mesh, "position")[captured].astype(np.float64))
-    return found
+    return _found(mesh)  # The carrier is of an older version.
 
 
 def floater_counts(root: bpy.types.Collection) -> dict[int, int]:

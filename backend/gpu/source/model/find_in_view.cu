@@ -24,8 +24,8 @@ KERNEL(128, 1) find_in_view(const float *positions, const float *rows, int count
     float p[3];
     for (int i = 0; i < 3; i++)
         p[i] = view[4 * i] * position[0] + view[4 * i + 1] * position[1] + view[4 * i + 2] * position[2] + view[4 * i + 3];
-    // The low-pass filter, or a disc's minimum footprint, adds up to 1.5 pixels at the border.
-    const float room = -reach - 1.5f * MAX(p[2], near) / MIN(fx, fy);
+    // The low-pass filter, or a disc's minimum footprint, adds up to 1.9 pixels at the border.
+    const float room = -reach - 1.9f * MAX(p[2], near) / MIN(fx, fy);
     const float across[4] = {p[0], p[0], p[1], p[1]}, focal[4] = {fx, -fx, fy, -fy};
     const float to_edge[4] = {cx, width - cx, cy, height - cy};
     bool seen = p[2] + reach > near;

@@ -1,6 +1,7 @@
 // Projection of Gaussians to screen splats, one thread per splat; see splats.py for the formulas and the columns.
 //
-// view (6, 4): three rows of the world-to-camera matrix; fx, fy, cx, cy; limits of x/z and y/z; position and near plane.
+// view (7, 4): three rows of the world-to-camera matrix; fx, fy, cx, cy; limits of x/z and y/z; position and near plane;
+// variance of the low-pass filter.
 // COEFFICIENTS: of spherical harmonics. HALF_H < 0 marks a splat that is not visible.
 #include "projection.h"
 

@@ -81,8 +81,9 @@ DEVICE Footprint footprint_of(const double *view, const float *mean, const float
 #if !FLAT
     const double x = f.V[0][1] * f.V[1][2] - f.V[0][2] * f.V[1][1];
     const double y = f.V[0][2] * f.V[1][0] - f.V[0][0] * f.V[1][2];
-    square += x * x + y * y + EPS_2D * (a + c + EPS_2D);
-    a += EPS_2D, c += EPS_2D;
+    const double blur = view[24];
+    square += x * x + y * y + blur * (a + c + blur);
+    a += blur, c += blur;
 #endif
     const double per_c = 1.0 / c;
     f.a = a, f.b = b, f.c = c;
