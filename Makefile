@@ -39,12 +39,13 @@ GPU_SECONDS ?= 240
 # The capture that benchmarks/gpu.py trains on, where there is one.
 CAPTURE ?= $(wildcard build/demo/capture)
 
-.PHONY: help venv lock demo demo-photos zip test test-long test-slow test-window test-blenders lint benchmarks gpu gpu-with clean
+.PHONY: help venv lock demo demo-photos zip manual test test-long test-slow test-window test-blenders lint benchmarks gpu gpu-with clean
 
 help:
 	@echo "make demo           a capture made by Blender becomes objects in a .blend, with a report, in $(DEMO)"
 	@echo "make demo-photos    the same from the photos alone, in $(DEMO)-photos"
 	@echo "make zip            the extension to install in Blender, in build/"
+	@echo "make manual         docs/manual/manual.html anew, after a change of the manual or the guide"
 	@echo "make test           the tests, within ten minutes"
 	@echo "make test-long      the other tests of CI: each takes many seconds"
 	@echo "make test-slow      tests that take minutes, such as those of the cache of kernels"
@@ -96,6 +97,9 @@ zip: .venv-bpy/ready
 	@mkdir -p build
 	$(BLENDER_EXT) build --source-dir . --output-dir build
 	$(BLENDER_EXT) validate build/objectgs-*.zip
+
+manual: .venv/ready
+	$(BACKEND) docs/build_manual.py
 
 test: .venv/ready .venv-bpy/ready
 	$(BACKEND) -m pytest $(WORKERS) -m "not long and not slow" tests/backend

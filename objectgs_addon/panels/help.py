@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A short help, opened by the question mark of the first panel, with a button that opens the folder of the manual."""
+"""A short help, opened by the question mark of the first panel, with a button that opens the manual."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import bpy
 
 from ..environment.extension import ROOT
 
-MANUAL = ROOT / "docs" / "manual"
-"""The pages of the manual, which the extension contains without their pictures."""
+MANUAL = ROOT / "docs" / "manual" / "manual.html"
 STEPS = (
     ("Import Photos or Video", "IMAGE_DATA", "computes where they were taken"),
     ("Import Capture", "IMPORT", "reads photos and their cameras"),
@@ -40,4 +39,4 @@ class HelpPanel(bpy.types.Panel):
         column = layout.column(align=True)
         column.label(text="The large button at the top is the next step.")
         column.label(text="Tooltips say why a button cannot be pressed.")
-        layout.operator("wm.path_open", text="Open Manual Folder", icon="HELP").filepath = str(MANUAL)
+        layout.operator("wm.path_open", text="Open Manual", icon="HELP").filepath = str(MANUAL)

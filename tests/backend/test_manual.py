@@ -1,6 +1,8 @@
 """The manual's links, pictures and names of buttons."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,6 +35,19 @@ def test_pictures_are_used_and_small():
     pictures = set((MANUAL / "images").iterdir())
     assert pictures <= used
     assert all(picture.stat().st_size < LARGEST for picture in pictures)
+
+
+def test_web_page_is_that_of_the_pages_and_has_all_that_it_links_to():
+    check = [sys.executable, str(MANUAL.parent / "build_manual.py"), "--check"]
+    assert subprocess.run(check, check=False).returncode == 0
+    page = (MANUAL / "manual.html").read_text(encoding="utf-8")
+    anchors = re.findall(r' id="([^"]+)"', page)
+    assert len(anchors) == len(set(anchors))
+    links = re.findall(r' href="([^"]+)"', page)
+    assert {link for link in links if "://" not in link} <= {f"#{anchor}" for anchor in anchors}
+    assert len(links) > 50
+    pictures = {MANUAL / path for path in re.findall(r' src="([^"]+)"', page)}
+    assert pictures == set((MANUAL / "images").iterdir())
 
 
 def test_every_page_is_in_the_contents():
