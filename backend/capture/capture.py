@@ -23,6 +23,7 @@ only."""
 
 MIN_VIEWS_TO_HOLD_OUT = 3
 _PIXEL_TOLERANCE = 0.5
+_PIXELS_AT_ONCE = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -271,14 +272,18 @@ class Capture:
     def _pixels_of_photo(self, index: int) -> np.ndarray:
         """Return for each pixel of a view's photo the pixel of the view, counted by rows: (H, W) int32, -1: none."""
         camera, view = self._raw[index][0], self.views[index]
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        # Comparisons with NaN are false.
-        at = self._undistorted(index, np.stack([x.ravel(), y.ravel()], 1))
-        inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
-        found = np.full(len(at), -1, np.int32)
-        column, row = at[inside].astype(np.int32).T
-        found[inside] = row * view.width + column
-        return found.reshape(camera.height, camera.width)
+        found = np.full((camera.height, camera.width), -1, np.int32)
+        across = np.arange(camera.width) + 0.5
+        rows_at_once = max(_PIXELS_AT_ONCE // camera.width, 1)
+        for first in range(0, camera.height, rows_at_once):
+            rows = found[first : first + rows_at_once]
+            x, y = np.meshgrid(across, np.arange(first, first + len(rows)) + 0.5)
+            # Comparisons with NaN are false.
+            at = self._undistorted(index, np.stack([x.ravel(), y.ravel()], 1))
+            inside = (at >= 0).all(1) & (at < [view.width, view.height]).all(1)
+            column, row = at[inside].astype(np.int32).T
+            rows.ravel()[inside] = row * view.width + column
+        return found
 
     def _undistorted(self, index: int, pixels: np.ndarray) -> np.ndarray:
         """Convert pixels (n, 2) of a view's photo to those of the view; NaN where undistortion does not converge."""

@@ -24,21 +24,19 @@ from ..shared.reconstruction.objects import default_name
 from .capture import MIN_VIEWS_TO_HOLD_OUT
 from .colmap import COLMAP, Camera, Image, Model
 from .files import (
-    HELD_OUT,
     Files,
     image_size,
     is_color_mask,
     is_three_channel,
     mask_names,
     mask_size,
-    read_held_out,
     read_image,
     read_mask,
-    read_names,
     same_shape,
 )
 from .made_masks import is_made
 from .models import none_found, photos_folder, read_capture_model
+from .names import HELD_OUT, read_held_out, read_names
 from .undistort import Pinhole, is_pinhole, pinhole_for
 
 Problem = Callable[[str], None]

@@ -39,9 +39,7 @@ def _reading(path: Path) -> Iterator[sqlite3.Connection]:
         with closing(sqlite3.connect(f"{_uri(path.resolve())}?mode=ro", uri=True, timeout=30.0)) as connection:
             yield connection
     except sqlite3.Error as error:
-        raise InputError(
-            f"{path} cannot be read ({error}); delete its folder and run the same command again."
-        ) from error
+        raise InputError(f"{path} cannot be read ({error}); delete it and run the same command again.") from error
 
 
 def name_of(on_objects: bool, network: str = "") -> str:

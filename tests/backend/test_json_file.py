@@ -2,7 +2,7 @@
 
 import pytest
 
-from backend.capture.files import read_names
+from backend.capture.names import read_names
 from backend.shared.errors import InputError
 from backend.shared.formats import json_file
 from backend.shared.formats.json_file import parse_json, read_json, write_json

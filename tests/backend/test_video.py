@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from fractions import Fraction
 
 import av
 import numpy as np
@@ -404,6 +405,109 @@ def test_doubles_and_live_photos_are_taken_once(tmp_path):
     taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
     assert [photo.name for photo in taken.photos] == ["a.jpg", "b.jpg", "c.jpg"] and not taken.unreadable
     assert sorted(path.name for path in (tmp_path / "capture" / "images").iterdir()) == ["a.jpg", "b.jpg", "c.jpg"]
+    chosen = photos.take_photos(list(folder.iterdir()), tmp_path / "chosen", None, reporter())
+    assert chosen.photos == taken.photos and not chosen.unreadable
+
+
+def test_of_raw_photos_of_one_name_the_dng_is_taken(tmp_path, monkeypatch):
+    folder = tmp_path / "raw"
+    folder.mkdir()
+    for name in ("a.cr2", "a.dng", "b.dng"):
+        (folder / name).write_bytes(name.encode())
+    monkeypatch.setattr(photo_files, "_developed", lambda path: Image.new("L", (8, 8), path.read_bytes()[2]))
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.png", "b.png"] and not taken.unreadable
+    with Image.open(tmp_path / "capture" / "images" / "a.png") as image:
+        assert image.getpixel((0, 0)) == ord("d")
+
+
+def test_photos_that_get_the_name_of_another_are_named(tmp_path):
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    for name in ("a.webp", "a.ppm", "b.jpg"):
+        Image.new("RGB", (160, 120)).save(folder / name)
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.png", "b.jpg"]
+    assert "a.webp has the name of another photo" in taken.unreadable["a.webp"]
+
+
+@pytest.mark.parametrize("upright", [True, False])
+def test_photos_are_turned_if_their_masks_are_upright(tmp_path, upright):
+    folder = tmp_path / "turntable"
+    for part in ("images", "masks"):
+        (folder / part).mkdir(parents=True)
+    for name, orientation in (("a", 1), ("b", 6)):
+        heic(folder / "images" / f"{name}.jpg", orientation=orientation)
+        size = (160, 120) if name == "a" or not upright else (120, 160)
+        Image.new("L", size, 1).save(folder / "masks" / f"{name}.png")
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.size for photo in taken.photos] == ["160x120", "120x160" if upright else "160x120"]
+    for name in "ab":
+        with Image.open(tmp_path / "capture" / "images" / f"{name}.jpg") as image:
+            assert read_mask(tmp_path / "capture" / "masks" / f"{name}.png").shape == image.size[::-1]
+
+
+def test_photos_with_known_cameras_are_not_turned(tmp_path):
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name, orientation=6)
+    for as_stored in (False, True):
+        capture = tmp_path / f"capture {as_stored}"
+        taken = photos.take_photos([folder], capture, None, reporter(), as_stored)
+        assert taken.photos[0].size == ("160x120" if as_stored else "120x160")
+        assert ((capture / "images" / "a.jpg").read_bytes() == (folder / "a.jpg").read_bytes()) == as_stored
+
+
+def test_panoramas_are_left_out(tmp_path):
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name)
+    sphere, exif = b'<rdf:Description GPano:ProjectionType="equirectangular"/>', Image.Exif()
+    Image.new("RGB", (160, 80)).save(folder / "sphere.jpg", xmp=sphere)
+    exif.get_ifd(0x8769)[0xA401] = 6
+    Image.new("RGB", (300, 80)).save(folder / "sweep.jpg", exif=exif)
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.jpg", "b.jpg"]
+    assert "a 360-degree panorama" in taken.unreadable["sphere.jpg"]
+    assert "a stitched panorama" in taken.unreadable["sweep.jpg"]
+
+
+def test_masks_of_any_case_and_thumbnails_are_no_photos(tmp_path):
+    folder = tmp_path / "trip"
+    (folder / "@eaDir" / "a.jpg").mkdir(parents=True)
+    for name in ("a.jpg", "b.JPG", "@eaDir/a.jpg/SYNOPHOTO_THUMB_XL.jpg"):
+        heic(folder / name)
+    for name in ("a_Mask.PNG", "b_MASK.png"):
+        Image.new("L", (160, 120), 1).save(folder / name)
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.jpg", "b.JPG"]
+    assert len(list((tmp_path / "capture" / "masks").iterdir())) == 2
+
+
+def test_masks_for_features_have_the_size_of_the_photos(tmp_path):
+    for part in ("images", "masks"):
+        (tmp_path / part).mkdir()
+    for name in ("a", "b"):
+        heic(tmp_path / "images" / f"{name}.jpg")
+    ids = np.zeros((60, 80), np.uint8)
+    ids[:, 40:] = 7
+    Image.fromarray(ids).save(tmp_path / "masks" / "a.png")
+    photos.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+    half, whole = (np.asarray(Image.open(tmp_path / "features" / f"{name}.jpg.png")) for name in "ab")
+    assert half.shape == whole.shape == (120, 160) and (whole == 255).all()
+    assert (half[:, :80] == 0).all() and (half[:, 80:] == 255).all()
+    Image.fromarray(ids.T).save(tmp_path / "masks" / "a.png")
+    with pytest.raises(InputError, match=r"60x80 pixels, but the photo a\.jpg is 160x120"):
+        photos.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+
+
+def test_pixels_of_videos_are_made_square(tmp_path):
+    write_video(tmp_path / "a.mp4", pan(12), sample_aspect_ratio=Fraction(4, 3))
+    names = video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", 3, reporter())
+    with Image.open(tmp_path / "frames" / names[0]) as image:
+        assert image.size == (256, 144)
 
 
 def test_chosen_files_are_those_chosen(tmp_path):

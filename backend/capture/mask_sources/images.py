@@ -17,9 +17,9 @@ from ..files import (
     mask_names,
     read_image,
     read_mask,
-    read_names,
 )
 from ..models.photos import Photos
+from ..names import read_names
 from .segments import Segments, Shape, draw_shapes
 
 _GRAY = 0.02

@@ -87,32 +87,40 @@ def read_point_cloud(path: Path, warnings: list[str]) -> RawPoints:
     Raises:
         InputError: The file is damaged or has no coordinates.
     """
-    xyz, rgb = _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
-    if len(xyz) > _MOST_POINTS:
-        warnings.append(f"{path} has {len(xyz):,} points, of which {_MOST_POINTS:,} are used.")
-        kept = np.linspace(0, len(xyz) - 1, _MOST_POINTS).astype(np.int64)
-        xyz, rgb = xyz[kept], rgb[kept]
+    count, xyz, rgb = _read_obj(path) if path.suffix.lower() == ".obj" else _read_ply(path)
+    if len(xyz) < count:
+        warnings.append(f"{path} has {count:,} points, of which {len(xyz):,} are used.")
     return RawPoints(np.arange(len(xyz)), xyz, rgb, np.full(len(xyz), -1.0))
 
 
-def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _used(count: int) -> np.ndarray:
+    """Return which of the points of a file are used, evenly distributed over it."""
+    return np.linspace(0, count - 1, min(count, _MOST_POINTS)).astype(np.int64)
+
+
+def _read_ply(path: Path) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return the number of points in the file, and positions and colors of those that are used."""
     table = read_vertices(path, text=True)
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path} has no coordinates x, y and z; {export_again('the program that wrote it')}.")
+    count = len(table)
+    # Before the conversion, since dense clouds would take gigabytes.
+    table = table[_used(count)]
     xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
     channels = next((group for group in _COLORS if set(group) <= set(names)), None)
     if channels is None:
-        return xyz, np.full((len(xyz), 3), _GRAY, np.uint8)
-    return xyz, _as_bytes(np.stack([table[channel] for channel in channels], 1))
+        return count, xyz, np.full((len(xyz), 3), _GRAY, np.uint8)
+    return count, xyz, _as_bytes(np.stack([table[channel] for channel in channels], 1))
 
 
-def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_obj(path: Path) -> tuple[int, np.ndarray, np.ndarray]:
+    """Return the same as `_read_ply`, of the vertices of a mesh."""
     try:
         lines = [line[2:] for line in read_regular(path).split(b"\n") if line.startswith((b"v ", b"v\t"))]
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the file.") from error
-    rows = [line.split() for line in lines]
+    rows = [lines[number].split() for number in _used(len(lines)).tolist()]
     columns = {len(row) for row in rows}
     try:
         if len(columns) > 1 or columns - {3, 4, 6, 7}:
@@ -123,8 +131,8 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path} has a vertex that is not three coordinates with or without a color; save it as PLY."
         ) from error
     if values.shape[1] < 6:
-        return values[:, :3], np.full((len(values), 3), _GRAY, np.uint8)
-    return values[:, :3], _as_bytes(values[:, -3:])
+        return len(lines), values[:, :3], np.full((len(values), 3), _GRAY, np.uint8)
+    return len(lines), values[:, :3], _as_bytes(values[:, -3:])
 
 
 def _as_bytes(colors: np.ndarray) -> np.ndarray:

@@ -51,6 +51,8 @@ PICTURE = "sfm.png"
 
 _EXTRACT, _MATCH, _MAP, _DENSE = 0.5, 0.03, 0.3, 0.6
 """Expected seconds of the stages for each photo, pair, photo and photo on two cores, until the pace is known."""
+_COMPARE = 0.0006
+"""Those of a pair of photos that are compared to choose what is matched."""
 _EXTRACT_LEARNED, _MATCH_LEARNED = 1.0, 1.5
 """Those of SuperPoint and LightGlue."""
 _MATCH_LOFTR, _JOIN = 12.0, 0.02
@@ -141,7 +143,9 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
-    photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter)
+    photos, unreadable, in_order = take_photos(
+        made_from.photos, capture, made_from.frames, reporter, as_stored=made_from.calibration is not None
+    )
     if are_copied(made_from.photos, capture):
         source = images
     else:
@@ -157,6 +161,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     if kind == LOFTR:
         per_photo, per_pair = _EXTRACT if count > ALL_UP_TO else 0.0, _MATCH_LOFTR
         reporter.expect({"join": ("Matching", _JOIN * pairs_expected)})
+    if count > ALL_UP_TO and not in_order:
+        reporter.expect({"pairs": ("Pairs", _COMPARE * count * (count - 1) / 2)})
     reporter.expect({
         "extract": ("Features", per_photo * count), "match": ("Matching", per_pair * pairs_expected),
         "global": ("Poses", _MAP * count), "incremental": ("Poses", 0.1 * _MAP * count),

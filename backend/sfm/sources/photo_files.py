@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
+import re
 import shutil
 import warnings
 from collections.abc import Callable
@@ -31,6 +32,11 @@ _ZOOM = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTag
 """EXIF entries of the lens; a digital zoom keeps the size and the focal length."""
 _QUALITY = 97
 """JPEG quality of photos that are converted or turned."""
+_PROJECTION = re.compile(rb"GPano:ProjectionType\W+(\w+)")
+_PROJECTIONS = {b"equirectangular": "a 360-degree panorama", b"cylindrical": "a stitched panorama"}
+"""Entry of Google's Photo Sphere data in XMP, and its values."""
+_PANORAMA = 6
+"""Value of the EXIF entry CustomRendered of panoramas taken with phones by Apple."""
 
 pillow_heif.register_heif_opener()
 
@@ -169,6 +175,32 @@ def _as_jpeg(path: Path, change: Callable[[PilImage.Image], PilImage.Image]) -> 
 def _orientation(exif: PilImage.Exif) -> int:
     value = exif.get(ExifTags.Base.Orientation, 1)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def is_turned_by_right_angle(path: Path) -> bool:
+    """Return whether a JPEG is to be shown with its width as height, by its EXIF orientation."""
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        return False
+    try:
+        with PilImage.open(path) as image:
+            return _orientation(image.getexif()) > 4
+    except Exception:
+        return False
+
+
+def projection_of(path: Path) -> str | None:
+    """Return what a photo is instead of a picture by one lens, by its XMP and EXIF data; None for all others."""
+    if path.suffix.lower() not in (".jpg", ".jpeg"):
+        return None
+    with suppress(Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PilImage.open(path) as image:
+            found = _PROJECTION.search(image.info.get("xmp", b""))
+            if found is not None:
+                return _PROJECTIONS.get(found[1].lower())
+            if image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.CustomRendered) == _PANORAMA:
+                return _PROJECTIONS[b"cylindrical"]
+    return None
 
 
 def _is_turned(path: Path) -> bool:

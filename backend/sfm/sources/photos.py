@@ -6,14 +6,25 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, write_image
+from ...capture.files import (
+    LOSSY_SUFFIXES,
+    Files,
+    encode_mask,
+    image_size,
+    mask_names,
+    mask_size,
+    read_mask,
+    same_shape,
+    write_image,
+)
 from ...capture.made_masks import is_made
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...shared.errors import InputError
@@ -29,6 +40,8 @@ FRAMES, _FILES = "frames.json", "photos.json"
 """Files in sfm/ with the frames that were taken of each video, and with the size and time of each photo's file."""
 _OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
 _READS_ALL_NAMES = os.name != "nt"
+_NOT_OF_USERS = (".", "@eaDir", "#recycle")
+"""How names of files and folders begin that computers put beside photos, such as thumbnails."""
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
 
@@ -80,7 +93,9 @@ class Taken(NamedTuple):
     in_order: bool
 
 
-def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, reporter: StoppingReporter) -> Taken:
+def take_photos(
+    sources: Sequence[Path], capture: Path, frames: int | None, reporter: StoppingReporter, as_stored: bool = False
+) -> Taken:
     """Copy photos and frames of videos to the images/ of a capture, unless they are there.
 
     Args:
@@ -91,6 +106,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         capture: the capture's folder.
         frames: wanted number of frames of each video; None: by its motion.
         reporter: receives progress and warnings.
+        as_stored: whether photos are not turned as their EXIF orientation says, since what is known of their cameras is
+            about the pixels as they are stored.
 
     Raises:
         InputError: There are fewer than two photos, or too little space on the disk.
@@ -103,12 +120,12 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
         base = source / IMAGES if (source / IMAGES).is_dir() else source
         found = _listed(base, capture)
     else:
-        found = sorted({path.absolute() for path in sources}, key=lambda path: natural_order(path.as_posix()))
+        found = _without_doubles(path.absolute() for path in sources)
         try:
             base = Path(os.path.commonpath([path.parent for path in found]))
         except ValueError as error:
             raise InputError(f"{found[0]} and {found[-1]} are on two disks; copy the photos to one folder.") from error
-    found, masked = _without_masks(found)
+    found, masks_beside = _without_masks(found)
     is_alone = len(found) == 1 and not source.is_dir()
     in_place = base.resolve() == (capture / IMAGES).resolve()
     videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
@@ -119,8 +136,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
     if not in_place:
         copies = ((path, capture / IMAGES / _readable(path.relative_to(base))) for path in files)
         _require_space([path for path, copy in copies if not _is_copied(copy)], capture)
-    # Masks fit the pixels as they are stored.
-    turn = not in_place and not (source / MASKS).is_dir() and not masked
+    turn = not in_place and not as_stored and _are_upright(base, source, files, bool(masks_beside))
     photos, unreadable = [], {}
     names: dict[str, str] = {}
     stamps = _Stamps(capture)
@@ -133,6 +149,10 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             camera = "" if is_raw else photo_files.camera_of(path, turn)
             if in_place and not photo_files.is_read_by_colmap(path):
                 raise InputError(f"{path.name} would have to be converted; choose another folder as --out.")
+            if (projection := photo_files.projection_of(path)) is not None:
+                raise InputError(
+                    f"{path.name} is {projection}, which no pinhole camera takes; cut it into perspective images first."
+                )
             copy = _readable(relative)
             if copy != relative and (in_place or not turn):
                 raise InputError(f"{path.name} is a name that COLMAP cannot read on Windows; use plain letters.")
@@ -142,6 +162,8 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             if not in_place:
                 copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
+                if relative.as_posix() in names.values():
+                    raise InputError(f"{path.name} has the name of another photo once it is converted; rename it.")
                 if is_raw:
                     camera = photo_files.camera_of(copied, False)
             photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
@@ -170,7 +192,7 @@ def take_photos(sources: Sequence[Path], capture: Path, frames: int | None, repo
             _copy_rest(source, capture, stamps)
         masks = MaskFiles(source / MASKS, names, base)
         _write_masks(masks, masks.lossy, names, capture, stamps)
-    if masked:
+    if masks_beside:
         masks = MaskFiles(base, names, base)
         _write_masks(masks, masks.photos, names, capture, stamps)
     stamps.write()
@@ -195,13 +217,31 @@ def _readable(relative: Path) -> Path:
     return Path("".join(letters))
 
 
-def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
-    """Return the photos and videos without those that are masks of others beside them, and whether there are masks."""
-    known = {path.as_posix() for path in paths}
-    masks = {
-        name for path in paths for names in mask_names(path.as_posix(), beside=True) for name in names if name in known
-    }
-    return [path for path in paths if path.as_posix() not in masks], bool(masks)
+def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], set[str]]:
+    """Return the photos and videos without those that are masks of others beside them, and the names of these."""
+    known = {path.as_posix().casefold() for path in paths}
+    candidates = (name.casefold() for path in paths for names in mask_names(path.as_posix(), True) for name in names)
+    masks = known & set(candidates)
+    return [path for path in paths if path.as_posix().casefold() not in masks], masks
+
+
+def _are_upright(base: Path, source: Path, files: Sequence[Path], are_beside: bool) -> bool:
+    """Return whether photos are to be turned as their EXIF orientation says: if they have no masks, or upright ones.
+
+    Other masks fit the pixels as they are stored. The first photo that is turned by a right angle decides.
+    """
+    folder = base if are_beside else source / MASKS
+    if not are_beside and not folder.is_dir():
+        return True
+    masks = Files(folder)
+    for path in files:
+        accepted, lossy = mask_names(path.relative_to(base).as_posix(), are_beside)
+        mask = masks.first(accepted) or masks.first(lossy)
+        with suppress(InputError):
+            if mask is not None and photo_files.is_turned_by_right_angle(path):
+                size = image_size(path)
+                return not same_shape(mask_size(mask), size) and same_shape(mask_size(mask), size[::-1])
+    return False
 
 
 def _write_masks(
@@ -253,29 +293,37 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
 
 
 def _listed(base: Path, capture: Path) -> list[Path]:
-    """Return the photos and videos below a folder in natural order, without those of the capture, if it is in there.
-
-    Of a raw or HEIC photo beside its JPEG, the latter is taken, of a raw photo beside its HEIC, that, and of a Live
-    Photo the photo alone.
-    """
+    """Return the photos and videos below a folder, as from `_without_doubles`, but for those of the capture in it."""
     try:
         inside = capture.resolve()
-        paths = [
+        return _without_doubles(
             path
             for path in base.rglob("*")
             if path.suffix.lower() in PHOTOS | VIDEOS
-            and not any(part.startswith(".") for part in path.relative_to(base).parts)
+            and not any(part.startswith(_NOT_OF_USERS) for part in path.relative_to(base).parts)
             and path.is_file()
             and (base.resolve().is_relative_to(inside) or not path.resolve().is_relative_to(inside))
-        ]
+        )
     except OSError as error:
         raise InputError(f"{error.filename or base} cannot be read ({error.strerror}); check it.") from error
+
+
+def _without_doubles(found: Iterable[Path]) -> list[Path]:
+    """Return photos and videos in natural order, without what shows the same as another.
+
+    Of a raw or HEIC photo beside its JPEG, the latter is taken, of a raw photo beside its HEIC, that, of two raw ones
+    the DNG, and of a Live Photo the photo alone.
+    """
+    paths = set(found)
     copied = {path.with_suffix("") for path in paths if path.suffix.lower() in photo_files.COPIED}
     developed = {path.with_suffix("") for path in paths if path.suffix.lower() in PHOTOS - photo_files.RAW}
     photos = {path.with_suffix("") for path in paths if path.suffix.lower() in PHOTOS}
+    converted = {path.with_suffix("") for path in paths if path.suffix.lower() == ".dng"}
 
     def is_double(path: Path) -> bool:
         suffix = path.suffix.lower()
+        if suffix in photo_files.RAW and suffix != ".dng" and path.with_suffix("") in converted:
+            return True
         others = photos if suffix in VIDEOS else developed if suffix in photo_files.RAW else copied
         return suffix not in photo_files.COPIED and path.with_suffix("") in others
 
@@ -314,10 +362,18 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
         raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
     shutil.rmtree(folder, ignore_errors=True)
     for name in names:
-        ids = read_mask(found[name]) if name in found else np.ones(image_size(capture / IMAGES / name)[::-1], np.uint8)
+        size = image_size(capture / IMAGES / name)
+        ids = read_mask(found[name]) if name in found else np.ones((1, 1), np.uint8)
+        if name in found and not same_shape(ids.shape[::-1], size):
+            raise InputError(
+                f"{found[name]} is {ids.shape[1]}x{ids.shape[0]} pixels, but the photo {name} is {size[0]}x{size[1]}; "
+                "make the mask the photo's size."
+            )
         target = folder / f"{name}.png"
         make_folder(target.parent)
-        write_image(target, Image.fromarray((ids > 0).astype(np.uint8) * 255))
+        # COLMAP looks features up in it by the pixels of the photo.
+        shown = Image.fromarray((ids > 0).astype(np.uint8) * 255)
+        write_image(target, shown if shown.size == size else shown.resize(size, Image.Resampling.NEAREST))
 
 
 def _copy_rest(source: Path, capture: Path, stamps: _Stamps) -> None:

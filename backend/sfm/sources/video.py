@@ -40,12 +40,14 @@ class Analysis(NamedTuple):
         sharp: (n,) sharpness.
         interlaced: whether the frames are two half-pictures.
         broken: number of packets that cannot be decoded.
+        pixel_aspect: width of the pixels relative to their height.
     """
 
     positions: np.ndarray
     sharp: np.ndarray
     interlaced: bool
     broken: int
+    pixel_aspect: float
 
 
 def write_frames(video: Path, folder: Path, count: int | None, reporter: StoppingReporter) -> list[str]:
@@ -74,7 +76,7 @@ def write_frames(video: Path, folder: Path, count: int | None, reporter: Stoppin
         if number in wanted:
             reporter.progress(0.6 + 0.4 * len(names) / len(wanted), 1.0)
             names.append(f"frame_{number:06d}.jpg")
-            image = PilImage.fromarray(to_rgb(frame))
+            image = PilImage.fromarray(to_rgb(frame, found.pixel_aspect))
             with atomic_path(folder / names[-1]) as part:
                 image.save(part, "JPEG", quality=_QUALITY, subsampling=0)
             if len(names) == len(wanted):
@@ -88,6 +90,7 @@ def analyze(video: Path, reporter: StoppingReporter) -> Analysis:
     problems: list[str] = []
     with _opened(video) as (container, stream):
         expected = float(container.duration or 0) / av.time_base
+        aspect = float(stream.sample_aspect_ratio or 1)
         for frame in _decoded(container, stream, problems):
             # Also where the duration is not known, since a request to stop is noticed here.
             is_known = frame.time is not None and expected > 0
@@ -99,11 +102,16 @@ def analyze(video: Path, reporter: StoppingReporter) -> Analysis:
     if not positions:
         why = f" ({problems[0]})" if problems else ""
         raise InputError(f"No picture of {video} can be decoded{why}; convert it to MP4 by another program.")
-    return Analysis(np.array(positions), np.array(sharp), interlaced > _INTERLACED * len(positions), len(problems))
+    return Analysis(
+        np.array(positions), np.array(sharp), interlaced > _INTERLACED * len(positions), len(problems), aspect
+    )
 
 
-def to_rgb(frame: Any) -> np.ndarray:
-    """Return a frame as (h, w, 3) uint8 in sRGB, turned as the video says; HDR is brought into its range."""
+def to_rgb(frame: Any, pixel_aspect: float = 1.0) -> np.ndarray:
+    """Return a frame as (h, w, 3) uint8 in sRGB, turned as the video says; HDR is brought into its range.
+
+    pixel_aspect: width of its pixels relative to their height, which are made square.
+    """
     matrix = frame.colorspace
     if matrix == _UNSPECIFIED and frame.height >= _HD:
         matrix = _BT709
@@ -114,6 +122,9 @@ def to_rgb(frame: Any) -> np.ndarray:
         signal = frame.to_ndarray(format="rgb48le", src_colorspace=matrix).astype(np.float32) / 65535
         shown = hdr.to_srgb(curve(signal), wide=int(frame.color_primaries) == _BT2020)
         pixels = (255 * shown + 0.5).astype(np.uint8)
+    if pixel_aspect != 1.0:
+        size = (max(round(pixel_aspect * frame.width), 1), frame.height)
+        pixels = np.asarray(PilImage.fromarray(pixels).resize(size, PilImage.Resampling.LANCZOS))
     return np.ascontiguousarray(np.rot90(pixels, round(frame.rotation / 90) % 4))
 
 
