@@ -31,9 +31,11 @@ from .kernel_cache import use_private_cache
 from .parser import UsageError, build_parser
 
 _OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG)
-_LONGEST = 1000
 _UNALLOCATED = ("allocate memory", "DefaultCPUAllocator: not enough memory")
+_LONGEST = 1000
 """Number of characters of an error message; names and paths in it may be longer."""
+_AGAIN, _RESTART = "the same command again", "--restart"
+"""Words of the message of a stop, and the option that would discard what it says is kept."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,7 +113,10 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         _tell(functools.partial(reporter.error, **fields), _shortened(str(error)))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
-        _tell(reporter.stopped, str(error) or "Stopped immediately.")
+        stopped = str(error) or "Stopped immediately."
+        if _RESTART in arguments:
+            stopped = stopped.replace(_AGAIN, f"{_AGAIN} without {_RESTART}")
+        _tell(reporter.stopped, stopped)
         return EXIT_CANCELLED
     except ProcessLost as error:
         _tell(reporter.error, str(error))

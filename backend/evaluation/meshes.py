@@ -14,7 +14,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 from ..mesh.texture.zbuffer import draw_mesh
-from ..raster import devices
+from ..raster import Camera, devices
 from ..shared.errors import InputError
 from ..shared.events import Reporter
 from ..shared.formats.mesh_ply import Mesh, read_mesh
@@ -30,6 +30,8 @@ meshes, and a stricter one."""
 SAMPLES = 30_000
 _NEIGHBORS = 6
 _SUBPIXELS = 3
+_PIXELS_AT_ONCE = 500_000
+"""Number of pixels of a photo that are compared at a time, each of which takes about a kilobyte."""
 
 
 class SampledSurface:
@@ -214,28 +216,56 @@ def texture_score(
         if not wanted.any():
             continue
         rows, columns = np.flatnonzero(wanted.any(1)), np.flatnonzero(wanted.any(0))
-        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        wanted = wanted[part]
-        K = scene.camera(index).K.copy()
-        K[:2, 2] -= columns[0], rows[0]
-        K[:2] *= _SUBPIXELS
-        height, width = wanted.shape
-        camera = replace(scene.camera(index), K=K, width=width * _SUBPIXELS, height=height * _SUBPIXELS)
-        _, face, weights = draw_mesh(vertices, mesh.faces, camera)
-        drawn = face >= 0
-        colors = np.zeros((*face.shape, 3), np.float32)
-        uvs = np.einsum("nc,ncx->nx", weights[drawn], mesh.uvs[face[drawn]])
-        colors[drawn] = sample_texture(texture, uvs)
-        blocks = (height, _SUBPIXELS, width, _SUBPIXELS)
-        count = drawn.reshape(blocks).sum((1, 3))
-        # A pixel counts as covered if at least half of it is; its color is the mean over the covered part.
-        covered = wanted & (2 * count >= _SUBPIXELS**2)
-        pixels = colors.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
-        error = pixels - devices.host(photo)[:, *part].transpose(1, 2, 0)[covered]
-        score.pixels += int(wanted.sum())
-        score.covered += int(covered.sum())
-        score.squares += float((error.astype(np.float64) ** 2).sum())
+        pixels = devices.host(photo)
+        # In bands, since the parts of their pixels take much memory.
+        height = max(_PIXELS_AT_ONCE // (columns[-1] + 1 - columns[0]), 1)
+        for first in range(rows[0], rows[-1] + 1, height):
+            part = slice(first, min(first + height, rows[-1] + 1)), slice(columns[0], columns[-1] + 1)
+            K = scene.camera(index).K.copy()
+            K[:2, 2] -= columns[0], first
+            camera = replace(scene.camera(index), K=K)
+            _add(score, mesh, vertices, texture, camera, wanted[part], pixels[:, part[0], part[1]])
     return score
+
+
+def _add(
+    score: TextureScore,
+    mesh: Mesh,
+    vertices: np.ndarray,
+    texture: np.ndarray,
+    camera: Camera,
+    wanted: np.ndarray,
+    photo: np.ndarray,
+) -> None:
+    """Add the pixels of a part of a view to a score.
+
+    Args:
+        score: The sums.
+        mesh, texture: As for `texture_score`.
+        vertices: The vertices of the mesh in scene units.
+        camera: The camera, whose image begins with the part.
+        wanted: (h, w) bool, the pixels that are compared.
+        photo: (3, h, w) the photo.
+    """
+    height, width = wanted.shape
+    K = camera.K.copy()
+    K[:2] *= _SUBPIXELS
+    _, face, weights = draw_mesh(
+        vertices, mesh.faces, replace(camera, K=K, width=width * _SUBPIXELS, height=height * _SUBPIXELS)
+    )
+    drawn = face >= 0
+    colors = np.zeros((*face.shape, 3), np.float32)
+    uvs = np.einsum("nc,ncx->nx", weights[drawn], mesh.uvs[face[drawn]])
+    colors[drawn] = sample_texture(texture, uvs)
+    blocks = (height, _SUBPIXELS, width, _SUBPIXELS)
+    count = drawn.reshape(blocks).sum((1, 3))
+    # A pixel counts as covered if at least half of it is; its color is the mean over the covered part.
+    covered = wanted & (2 * count >= _SUBPIXELS**2)
+    pixels = colors.reshape(*blocks, 3).sum((1, 3))[covered] / count[covered][:, None]
+    error = pixels - photo.transpose(1, 2, 0)[covered]
+    score.pixels += int(wanted.sum())
+    score.covered += int(covered.sum())
+    score.squares += float((error.astype(np.float64) ** 2).sum())
 
 
 def mesh_entries(folder: Path, trained_steps: int, reporter: Reporter) -> dict[str, MeshEntry]:

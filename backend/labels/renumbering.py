@@ -57,11 +57,13 @@ def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent
     # As one more object, whose ID is 0.
     points = np.where(_without_id(list(seen.values()), len(found.points)), len(ids), found.points)
     ids = np.append(ids, 0)
+    type_of_ids = np.min_scalar_type(max(int(each.max()) for each in (ids, *(own.ids for own in regions.values()))))
+    ids = ids.astype(type_of_ids)
     anew = {}
     for index, objects in zip(masks, found.objects, strict=True):
         numbers, own = regions[index]
         shown = object_mask(numbers, seen[index], _shown_most(seen[index], objects, points), points)
-        anew[index] = np.where(shown > 0, ids[shown], own[numbers])
+        anew[index] = np.where(shown > 0, ids[shown], own.astype(type_of_ids)[numbers])
     return Renumbered(anew, agreement)
 
 

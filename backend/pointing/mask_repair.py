@@ -58,6 +58,7 @@ def repair_masks(
     """
     objects = np.unique([0, *(value for mask in given.values() for value in np.unique(mask).tolist())])
     type_of_ids = np.min_scalar_type(objects[-1])
+    type_of_votes = np.promote_types(type_of_ids, np.int8)
     masks = {index: pointer.voting_mask(index, mask.astype(type_of_ids)) for index, mask in given.items()}
     wrong = {index: np.zeros(mask.shape, bool) for index, mask in masks.items()}
     done, steps = itertools.count(1), (1 + _ROUNDS) * len(masks)
@@ -78,7 +79,7 @@ def repair_masks(
         if number == _ROUNDS or not changed:
             break
         for sign, then, now in ((-1, before, wrong), (1, wrong, before)):
-            voting = {i: np.where(now[i] & ~then[i], masks[i].astype(np.int64), _NO_VOTE) for i in changed}
+            voting = {i: np.where(now[i] & ~then[i], masks[i].astype(type_of_votes), _NO_VOTE) for i in changed}
             votes += sign * pointer.votes(voting, objects, tell)
         # Less than nothing is left by rounding only.
         np.maximum(votes, 0, out=votes)

@@ -115,7 +115,7 @@ class Stub:
 
         def make(target, options, trained, views, part):
             if len(self.made) == self._stop_at:
-                raise Cancelled("Stopped.")
+                raise Cancelled("Stopped. Run the same command again to continue.")
             self.made.append(target.key)
             entry = command._entry_of(target, options, trained)
             if target.key in without:
@@ -144,6 +144,17 @@ def test_existing_meshes_are_not_made_again(trained, run_command, monkeypatch):
         "2",
         "5",
     ]
+
+
+def test_meshes_that_are_made_anew_continue_after_a_stop(trained, run_command, monkeypatch):
+    Stub(monkeypatch)
+    assert run_command("mesh", trained).code == EXIT_DONE
+    stopped = Stub(monkeypatch, stop_at=1)
+    result = run_command("mesh", trained, "--restart")
+    assert result.code == EXIT_CANCELLED and stopped.made == ["1"]
+    assert "Run the same command again without --restart" in result.out
+    rest = Stub(monkeypatch)
+    assert run_command("mesh", trained).code == EXIT_DONE and rest.made == ["2", "5"]
 
 
 def test_a_job_that_ends_before_its_first_mesh_leaves_all_of_them(trained, run_command, monkeypatch):

@@ -394,7 +394,7 @@ def test_texture_sampling_matches_blender():
     assert found == pytest.approx(np.array([(0, 0, 1), (1, 1, 1), (1, 0, 0), (0.5, 0.5, 0.5), (1, 0, 0)]))
 
 
-def test_texture_psnr_uses_only_masked_pixels():
+def test_texture_psnr_uses_only_masked_pixels(monkeypatch):
     labels = np.zeros((30, 40), np.int32)
     labels[5:20, 4:30] = 1
     elsewhere = np.where((labels == 1)[..., None], photo, 0)
@@ -409,6 +409,10 @@ def test_texture_psnr_uses_only_masked_pixels():
     whole = texture_score(poster(), texture, FakeScene([photo], [None]), None, [0])
     assert whole.pixels == 1200 and whole.figures()["texture_psnr"] > 45
     assert texture_score(poster(), texture, FakeScene([photo], [None]), [4], [0]).pixels == 0
+    monkeypatch.setattr("backend.evaluation.meshes._PIXELS_AT_ONCE", 100)
+    bands = texture_score(poster(), texture, FakeScene([photo], [None]), None, [0])
+    assert (bands.pixels, bands.covered) == (whole.pixels, whole.covered)
+    assert bands.squares == pytest.approx(whole.squares, rel=1e-6)
 
 
 def test_holes_lower_texture_coverage():

@@ -250,6 +250,9 @@ class ExactViews:
         t[live] = np.where(np.abs(shape(camera_center + t[live, None] * rays[live])) < 1e-4, t[live], np.inf)
         return np.where(t < 20, t, np.inf)
 
+    def camera(self, index):
+        return self.cameras[index]
+
     def scene_map(self, index):
         depths = self.depths(index)
         nearest = depths.min(0)
@@ -318,6 +321,18 @@ def test_field_is_the_same_where_memory_for_observations_ends(monkeypatch):
     monkeypatch.setattr("backend.mesh.field.fusion._KEPT_BYTES", 1e6)
     again = fuse(views, [0])
     assert np.array_equal(kept.values, again.values) and np.array_equal(kept.seen, again.seen)
+
+
+def test_views_that_look_elsewhere_are_not_rendered(monkeypatch):
+    there = around(6)
+    away = [replace(camera, viewmat=np.diag([-1.0, 1, -1, 1]) @ camera.viewmat) for camera in there]
+    few, many = (ExactViews([ball((0.0, 0.0, 0.0), 0.5)], cameras) for cameras in (there, there + away))
+    wanted, rendered = fuse(few, [0]), []
+    monkeypatch.setattr(many, "scene_map", lambda index: rendered.append(index) or few.scene_map(index))
+    monkeypatch.setattr(many, "object_view", lambda index, _: few.object_view(index, [0]) if index < 6 else None)
+    found = fuse(many, [0])
+    assert set(rendered) == set(range(6))
+    assert np.array_equal(wanted.values, found.values) and np.array_equal(wanted.seen, found.seen)
 
 
 def test_ball_is_reconstructed_accurately():

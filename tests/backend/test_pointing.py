@@ -697,7 +697,7 @@ def test_label_refuses_foreign_masks_and_strokes_on_nothing(unlabeled, tmp_path,
     assert not (scene.folder / "masks" / "strokes.json").exists()
 
 
-def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path) -> None:
+def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path, monkeypatch) -> None:
     """Resampling a mask to the photo and back, through a strong distortion, changes few pixels at outlines only."""
     scene = write_capture(views=4, size=(96, 72), model="OPENCV", params=[90, 90, 48, 36, -0.2, 0.05, 0, 0])
     capture = load_capture(scene.folder, tmp_path / "cache")
@@ -705,6 +705,8 @@ def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path
     photo = capture.photo_mask(0, before)
     assert photo.shape == (72, 96) and photo.dtype == before.dtype
     assert np.array_equal(capture.photo_mask(1, before), photo), "of the same camera"
+    monkeypatch.setattr("backend.capture.capture._PIXELS_AT_ONCE", 500)
+    assert np.array_equal(load_capture(scene.folder, tmp_path / "cache").photo_mask(0, before), photo), "in strips"
     Image.fromarray(photo.astype(np.uint8)).save(scene.folder / "masks" / "view_000.png")
     after = load_capture(scene.folder, tmp_path / "other").mask(0)
     assert (before > 0).sum() > 200 and np.mean(before != after) < 0.03

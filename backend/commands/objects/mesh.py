@@ -71,9 +71,14 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         targets = _targets(options, folder)
         folder.meshes.mkdir(exist_ok=True)
         known = {} if options.restart else _known_meshes(folder)
-        wanted = [target for target in targets if not _is_current(known.get(target.key), target, options, trained)]
+        interrupted = read_waiting(folder.meshes)
+        wanted = [
+            target
+            for target in targets
+            if target.key in interrupted or not _is_current(known.get(target.key), target, options, trained)
+        ]
         waiting = [target.key for target in wanted]
-        if wanted or read_waiting(folder.meshes):
+        if wanted or interrupted:
             write_meshes(folder.meshes, _known_meshes(folder), trained.progress.step, waiting)
         discs = seconds_of_discs(trained) if wanted else 0.0
         reporter.expect({DISCS: ("Fitting discs", discs), "meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})

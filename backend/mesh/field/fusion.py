@@ -19,7 +19,7 @@ from ..surface import NoSurface
 from ..views import ObjectView, SceneMap
 from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
 from .holes import Patches
-from .integrate import Observation, add, prepare_observation, visible_depth
+from .integrate import Observation, add, may_add, prepare_observation, visible_depth
 from .marching import compact, march, parts
 from .winding import Winding
 
@@ -53,6 +53,8 @@ class SeesObjects(Protocol):
     """The part of the interface of `Views` that `fuse` uses."""
 
     indices: tuple[int, ...]
+
+    def camera(self, index: int) -> Camera: ...
 
     def scene_map(self, index: int) -> SceneMap: ...
 
@@ -257,7 +259,9 @@ class _Fusion:
         total = np.zeros((len(coords), SAMPLES), np.float32)
         weights = np.zeros((len(coords), SAMPLES), np.float32)
         for done, index in enumerate(self.views.indices):
-            add(self._observation(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
+            # Other views need not be rendered.
+            if index in self.observations or may_add(self.views.camera(index), self.origin, self.voxel, coords):
+                add(self._observation(index), self.origin, self.voxel, coords, self.reach, self.back, total, weights)
             self._progress(done + 1)
         return total, weights
 

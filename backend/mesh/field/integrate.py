@@ -164,6 +164,23 @@ def _slopes(object_depth, fx, fy, cx, cy, jump, slope, weight):
                 weight[v, u] *= 0.5
 
 
+def may_add(camera: Camera, origin: np.ndarray, voxel: float, coords: np.ndarray) -> bool:
+    """Return whether a view may show any of the blocks, so that `add` may change them; arguments as for `add`."""
+    viewmat, (fx, fy, cx, cy) = camera.arrays()
+    half = 0.5 * (SIDE - 1) * voxel
+    radius = half * np.sqrt(3.0)
+    centers = origin + coords * (SIDE * voxel) + half
+    x, y, z = viewmat[:3, :3] @ centers.T + viewmat[:3, 3:]
+    ahead = z + radius > camera.near
+    far = z > 2 * radius
+    with np.errstate(all="ignore"):
+        u, v = fx * x / z + cx, fy * y / z + cy
+        spread = 2 * radius / z * (1 + np.maximum(np.abs(x), np.abs(y)) / z)
+        beside = (u + fx * spread < 0) | (u - fx * spread > camera.width)
+        beside |= (v + fy * spread < 0) | (v - fy * spread > camera.height)
+    return bool((ahead & ~(far & beside)).any())
+
+
 def add(
     observation: Observation, origin: np.ndarray, voxel: float, coords: np.ndarray, reach: float, back: float,
     total: np.ndarray, weights: np.ndarray,
