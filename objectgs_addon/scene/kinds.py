@@ -7,6 +7,7 @@ Lookups never use names, since users rename data-blocks and Blender appends numb
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -149,24 +150,31 @@ def object_collections(root: bpy.types.Collection) -> dict[int, bpy.types.Collec
     for collection in root.children_recursive:
         if kind_of(collection) == OBJECT:
             found.setdefault(object_id_of(collection) or 0, collection)
-    parent = parent_of(root)
-    if parent is not None:
-        known = set(found.values())
-        for collection in bpy.data.collections:
-            if kind_of(collection) == OBJECT and collection not in known:
-                pivot = part_of(collection, OBJECT_PARENT)
-                if pivot is not None and pivot.parent == parent:
-                    found.setdefault(object_id_of(collection) or 0, collection)
+    for collection in _moved_out(root, OBJECT, found.values()):
+        found.setdefault(object_id_of(collection) or 0, collection)
     return found
 
 
 def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
     """Map the IDs of objects with duplicates to the duplicates' collections, in Blender's order."""
+    inside = [collection for collection in root.children_recursive if kind_of(collection) == DUPLICATE]
     found: dict[int, list[bpy.types.Collection]] = {}
-    for collection in root.children_recursive:
-        if kind_of(collection) == DUPLICATE:
-            found.setdefault(object_id_of(collection) or 0, []).append(collection)
+    for collection in [*inside, *_moved_out(root, DUPLICATE, inside)]:
+        found.setdefault(object_id_of(collection) or 0, []).append(collection)
     return found
+
+
+def _moved_out(
+    root: bpy.types.Collection, kind: str, inside: Iterable[bpy.types.Collection]
+) -> list[bpy.types.Collection]:
+    """Return the collections of a kind that the user moved out of the reconstruction, given those that are inside."""
+    parent = parent_of(root)
+    if parent is None:
+        return []
+    known = set(inside)
+    others = [each for each in bpy.data.collections if kind_of(each) == kind and each not in known]
+    pivots = ((each, part_of(each, OBJECT_PARENT)) for each in others)
+    return [each for each, pivot in pivots if pivot is not None and pivot.parent == parent]
 
 
 def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:

@@ -24,7 +24,7 @@ from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import older_files
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.picking import selection
-from objectgs.objectgs_addon.scene import carrier, kinds
+from objectgs.objectgs_addon.scene import capture, carrier, kinds
 from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
@@ -390,6 +390,21 @@ def test_transform_is_stored_in_capture_coordinates(root, folder, backend_python
     assert np.stack([table[axis] for axis in "xyz"], 1) == pytest.approx(independent(root, splats), abs=2e-4)
 
 
+def test_a_move_of_a_turned_object_far_from_the_origin_is_stored(root):
+    """There, the turn alone changes the translation by thousands of kilometers."""
+    root[capture.ORIGIN] = [5e5, 5.4e6, 100.0]
+    pivot = part(root, "object_parent")
+    pivot.rotation_euler.z += 1.5
+    blender_scene.store_placements(root)
+    turned = np.array(entry(root).transform)
+    blender_scene.store_placements(root)
+    assert np.array_equal(entry(root).transform, turned)
+    pivot.location.x += 0.5
+    blender_scene.store_placements(root)
+    moved = np.array(entry(root).transform) - turned
+    assert np.abs(moved[:3, :3]).max() == 0 and np.linalg.norm(moved[:3, 3]) == pytest.approx(0.5, abs=1e-4)
+
+
 def test_unmoved_objects_keep_exact_transform(root, folder):
     before = (folder / "objects.json").read_bytes()
     for collection in blender_scene.object_collections(root).values():
@@ -517,6 +532,19 @@ def test_duplicate_shares_data_and_is_stored(root, folder):
     selection.select_collections(bpy.context, [copy])
     assert bpy.ops.objectgs.remove_object() == {"FINISHED"}
     assert entry(root).copies == () and not entry(root).removed and not blender_scene.duplicates_of(root)
+
+
+def test_a_duplicate_that_the_user_moved_out_stays_stored(root):
+    activate(root, 1)
+    bpy.ops.objectgs.duplicate_object()
+    (copy,) = blender_scene.duplicates_of(root)[1]
+    kinds.part_of(copy, "object_parent").location.x += 4.0
+    blender_scene.store_placements(root)
+    stored = entry(root).copies
+    bpy.context.scene.collection.children.link(copy)
+    next(each for each in (root, *root.children_recursive) if copy.name in each.children).children.unlink(copy)
+    blender_scene.store_placements(root)
+    assert blender_scene.duplicates_of(root) == {1: [copy]} and len(stored) == 1 and entry(root).copies == stored
 
 
 def test_duplicates_follow_folder(root, folder):
@@ -732,6 +760,7 @@ def test_exported_meshes_have_edits(root, tmp_path, suffix):
         places = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
         expected = read_mesh(blender_scene.folder_of(root) / "meshes" / "1.ply").vertices
         assert len(places) == 12 and places[:4] == pytest.approx(expected, abs=1e-3)
+        assert all(path.name.startswith("all ") for path in tmp_path.glob("*.png"))
         assert "map_Kd" in (tmp_path / "all.mtl").read_text()
         texture = next(tmp_path.glob("*recolored*.png"))
         image = bpy.data.images.load(str(texture))

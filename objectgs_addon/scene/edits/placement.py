@@ -39,7 +39,7 @@ def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -
     if local is None:
         return None
     moved = local @ _shift(-_rest(part_of(collection, OBJECT_PARENT)))
-    return _about(moved, origin_of(root))
+    return about(moved, origin_of(root))
 
 
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:
@@ -47,7 +47,7 @@ def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, 
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
-    moved = np.eye(4) if place is None else _about(np.asarray(place, np.float64), -origin_of(root))
+    moved = np.eye(4) if place is None else about(np.asarray(place, np.float64), -origin_of(root))
     wanted = moved @ _shift(_rest(pivot)) @ np.linalg.inv(_own(collection, pivot))
     if pivot.parent is not None:
         wanted = np.linalg.inv(_map(pivot.parent, parent)) @ wanted
@@ -129,8 +129,8 @@ def _shift(by: np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _about(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the map `matrix` expressed in coordinates that are shifted by `origin`."""
+def about(matrix: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return the map `matrix` (4, 4) expressed in coordinates that are shifted by `origin` (3,)."""
     moved = matrix.copy()
     moved[:3, 3] += origin - matrix[:3, :3] @ origin
     return moved

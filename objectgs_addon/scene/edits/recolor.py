@@ -79,30 +79,32 @@ def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:
 
 
 def with_own_textures(
-    material: bpy.types.Material, recolor: Recolor, folder: Path
+    material: bpy.types.Material, recolor: Recolor | None, folder: Path, prefix: str = ""
 ) -> tuple[bpy.types.Material, list[bpy.types.Image]]:
-    """Copy a material with recolored texture images.
+    """Copy a material with copies of its texture images, which are recolored.
 
     Args:
         material: the material to copy.
-        recolor: the recoloring.
+        recolor: the recoloring; None to keep the colors.
         folder: where to save the images as PNG.
+        prefix: how the names of these files begin.
 
     Returns:
         The copy and its new images.
     """
-    matrix, offset = recolor.affine()
     copy, images = material.copy(), []
     _recolor_textures(copy, None)
     for node in [node for node in copy.node_tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
         source = node.image
         pixels = np.empty(4 * source.size[0] * source.size[1], np.float32)
         source.pixels.foreach_get(pixels)
-        colors = pixels.reshape(-1, 4)
-        colors[:, :3] = np.clip(colors[:, :3] @ matrix.T + offset, 0.0, 1.0)
-        image = bpy.data.images.new(f"{source.name} recolored", *source.size)
+        if recolor is not None:
+            matrix, offset = recolor.affine()
+            colors = pixels.reshape(-1, 4)
+            colors[:, :3] = np.clip(colors[:, :3] @ matrix.T + offset, 0.0, 1.0)
+        image = bpy.data.images.new(source.name if recolor is None else f"{source.name} recolored", *source.size)
         image.pixels.foreach_set(pixels)
-        image.filepath_raw = str(folder / f"{bpy.path.clean_name(image.name)}.png")
+        image.filepath_raw = str(folder / f"{prefix}{bpy.path.clean_name(image.name)}.png")
         image.file_format = "PNG"
         image.save()
         image.source = "FILE"

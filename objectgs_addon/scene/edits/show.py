@@ -18,12 +18,13 @@ from ....backend.shared.color.recolor import Recolor
 from ....backend.shared.reconstruction.folder import Reconstruction
 from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, is_singular, read_objects
 from .. import carrier
+from ..capture import origin_of
 from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
 from ..object_display import Objects
 from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
 from .fills import show_fills
 from .floaters import hide_floaters
-from .placement import PLACEMENT, local_placement, placement_of, rest_placement, set_placement
+from .placement import PLACEMENT, about, local_placement, placement_of, rest_placement, set_placement
 from .recolor import recolor_of, set_recolor
 
 REMOVED = "objectgs_removed"
@@ -138,9 +139,9 @@ def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | 
     for object_id in changed & entries.keys():
         entry, (place, copied) = entries[object_id], now[object_id]
         change = {}
-        if not _same([entry.transform], [place]):
+        if not _same(root, [entry.transform], [place]):
             change["transform"] = place
-        if not _same(entry.copies, copied):
+        if not _same(root, entry.copies, copied):
             change["copies"] = copied or None
         if change:
             changes[object_id] = change
@@ -253,14 +254,16 @@ def _rows(matrix: Any) -> list | None:
     return None if matrix is None else [list(row) for row in matrix]
 
 
-def _same(first: Any, second: Any) -> bool:
+def _same(root: bpy.types.Collection, first: Any, second: Any) -> bool:
     """Return whether two lists hold equal maps within single precision; None is the identity."""
+    origin = origin_of(root)
     if len(first) != len(second):
         return False
     for one, other in zip(first, second):
         if one is other:
             continue  # Usually both are None.
-        one, other = (np.array(_IDENTITY if matrix is None else matrix, float) for matrix in (one, other))
+        # Far from the origin, the translation of a map that turns or scales is much larger than the object's move.
+        one, other = (about(np.array(_IDENTITY if each is None else each, float), -origin) for each in (one, other))
         if not np.allclose(one, other, rtol=1e-6, atol=1e-6):
             return False
     return True

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 from mathutils import Matrix
 
 from ....backend.shared.errors import InputError
@@ -20,6 +21,8 @@ from .shading import lit
 
 _EXPORTERS = {"glb": (bpy.ops.export_scene, "gltf"), "usdc": (bpy.ops.wm, "usd_export")}
 """File suffix -> the operator that exports it, which is in an add-on or a part of Blender that may be missing."""
+_COARSEST = 1e-4
+"""Largest rounding of positions in mesh files, relative to the size of the meshes."""
 
 
 def export(
@@ -75,9 +78,26 @@ def export(
             for mesh in scene.parts_of(collection)
             if scene.kind_of(mesh) == "mesh"
         ]
-        with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture):
+        if in_capture:
+            _require_near(root, [mesh for _, mesh in parts])
+        # Other formats than GLB have textures beside them, where those of another file must not be replaced.
+        prefix = "" if suffix == "glb" else f"{path.stem} "
+        with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, prefix):
             _write(path, suffix, in_capture)
     return list(files)
+
+
+def _require_near(root: bpy.types.Collection, meshes: list[bpy.types.Object]) -> None:
+    """Raise InputError if the numbers of mesh files cannot tell the vertices of meshes apart in capture coordinates."""
+    places = [scene.matrix_to_capture(root, mesh) for mesh in meshes]
+    rounding = max(float(np.abs(place[:3, 3]).max()) for place in places) * 2.0**-23
+    corners = (np.array(mesh.bound_box) @ place[:3, :3].T for mesh, place in zip(meshes, places))
+    size = max(float(np.ptp(each, axis=0).max()) for each in corners)
+    if rounding > _COARSEST * size:
+        raise InputError(
+            f"In the capture's coordinates, mesh files would round positions to {rounding:.2g} units; choose Blender's "
+            "coordinates."
+        )
 
 
 def _write(path: Path, suffix: str, in_capture: bool) -> None:
@@ -98,18 +118,23 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
 
 
 @contextmanager
-def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
+def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str) -> Any:
     """Show a temporary scene with visible copies of the meshes in the window.
 
-    Recolored textures are replaced by recolored images, since exporters do not support the recolor node group.
+    Recolored textures are replaced by recolored images, since exporters do not support the recolor node group. With a
+    prefix, all textures are replaced by copies whose files' names begin with it.
     """
-    window = bpy.context.window or bpy.context.window_manager.windows[0]
-    before, layer = window.scene, window.view_layer
+    windows = bpy.context.window_manager.windows
+    window = bpy.context.window or windows[0]
+    # Other windows may show the same scene.
+    before = [(each, each.scene, each.view_layer) for each in windows]
     seen_from = [
-        (space.region_3d, space.region_3d.view_perspective)
-        for area in window.screen.areas
+        (region, region.view_perspective)
+        for each in windows
+        for area in each.screen.areas
         for space in area.spaces
         if space.type == "VIEW_3D"
+        for region in (space.region_3d, *space.region_quadviews)
     ]
     stage = bpy.data.scenes.new("ObjectGS export")
     made, copies = [], {}
@@ -126,19 +151,19 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool) -> Any:
                 stage.collection.objects.link(obj)
                 for slot, own in zip(obj.material_slots, mesh.material_slots):
                     material = own.material
-                    if scene.recolor_of(collection) is not None and material is not None:
+                    recolor = scene.recolor_of(collection)
+                    if material is not None and (prefix or recolor is not None):
                         if material not in copies:
-                            copies[material] = scene.with_own_textures(
-                                material, scene.recolor_of(collection), Path(folder)
-                            )
+                            copies[material] = scene.with_own_textures(material, recolor, Path(folder), prefix)
                         material = copies[material][0]
                     slot.link, slot.material = "OBJECT", material
             window.scene = stage
             stage.view_layers[0].update()
             yield
     finally:
-        window.scene = before
-        window.view_layer = layer
+        for each, owner, layer in before:
+            each.scene = owner
+            each.view_layer = layer
         for region, perspective in seen_from:
             # A scene without a camera ends the view through it.
             region.view_perspective = perspective
