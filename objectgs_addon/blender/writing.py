@@ -51,6 +51,16 @@ def allowed(function: Callable) -> Callable:
     return wrapper
 
 
+def later(function: Callable[[], None], seconds: float) -> None:
+    """Call a function once nothing has asked for it for some seconds; without a window at once."""
+    if bpy.app.background:
+        function()
+        return
+    if bpy.app.timers.is_registered(function):
+        bpy.app.timers.unregister(function)
+    bpy.app.timers.register(function, first_interval=seconds)
+
+
 def _call(_manager: Any) -> bool:
     _waiting.calls.pop()()
     return True

@@ -56,13 +56,14 @@ class CapturePanel(Tab, bpy.types.Panel):
             if not job.is_finished
             and (job.kind in _KINDS or (active is not None and _is_long(job, scene.folder_of(active))))
         ]
-        if active is not None:
+        if active is not None or _others(context.scene):
             row = layout.row(align=True)
             row.prop(context.scene.objectgs, "active", text="")
             row.menu("OBJECTGS_MT_add", text="", icon="ADD")
+        if active is not None:
             _draw_folder(layout, active)
         if step := _step(active, context.scene):
-            _draw_next_step(layout, step, jobs, active is not None and background.is_busy(active))
+            _draw_next_step(layout, step, jobs, _must_wait(active, jobs))
         else:
             _draw_jobs(layout, jobs)
         if active is None:
@@ -72,6 +73,22 @@ class CapturePanel(Tab, bpy.types.Panel):
             column.operator("objectgs.make_demo", icon="MESH_MONKEY")
         else:
             _draw_display(layout, context.scene.objectgs)
+
+
+def _others(owner: bpy.types.Scene) -> bool:
+    """Return whether a scene has a reconstruction that can be made the active one."""
+    return any(
+        scene.kind_of(each) == "reconstruction" and not scene.is_linked(each)
+        for each in owner.collection.children_recursive
+    )
+
+
+def _must_wait(active: bpy.types.Collection | None, jobs: list[tuple[int, Job]]) -> bool:
+    """Return whether the next step must wait for a job: of the same reconstruction, or the set-up of the backend."""
+    if active is None:
+        return bool(jobs)
+    folder = scene.folder_of(active)
+    return background.is_busy(active) or any(job.kind == "setup" or job.folder == folder for _, job in jobs)
 
 
 def draw_message(layout: bpy.types.UILayout) -> None:
@@ -125,10 +142,10 @@ def _draw_jobs(layout: bpy.types.UILayout, jobs: list[tuple[int, Job]]) -> None:
         draw_job(layout, job, index, job.kind not in _KINDS)
 
 
-def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int, Job]], is_busy: bool) -> None:
-    """Draw the button of the next step with its purpose, or with the jobs that must end before.
+def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int, Job]], must_wait: bool) -> None:
+    """Draw the button of the next step with its purpose, or with the jobs that run.
 
-    The button stays in its place meanwhile, so that what is below it does not move under the mouse.
+    The button stays in its place while it must wait, so that what is below it does not move under the mouse.
     """
     column = layout.column()
     if step.operator == "objectgs.set_up_backend":
@@ -139,7 +156,7 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
             device.enabled = not jobs
             device.prop(preferences, "device", expand=True)
     button = column.row()
-    button.enabled = not (jobs or is_busy)
+    button.enabled = not must_wait
     button.scale_y = 1.5
     if step == IMPORT:
         button = button.column(align=True)

@@ -205,7 +205,9 @@ def _handle_end(job: Job) -> None:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
     elif job.state is State.STOPPED and job.kind == "sfm":
         messages.show(after_stop(job))
-    if job.state is State.DONE or (job.state is State.STOPPED and job.kind in ("train", "label", "mesh")):
+    # One that was stopped while it waited has changed nothing.
+    has_changed = job.exit_code is not None and job.kind in ("train", "label", "mesh")
+    if job.state is State.DONE or (job.state is State.STOPPED and has_changed):
         _results.append(job)
     else:
         _submitted_in.pop(job, None)

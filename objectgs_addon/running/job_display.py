@@ -52,8 +52,7 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int, brief: bool =
         row.operator("objectgs.pause_job", text="", icon="PAUSE")
     if job.state is State.PAUSED:
         row.operator("objectgs.resume_job", text="", icon="PLAY")
-    if job.state is not State.STOPPING:
-        row.operator("objectgs.stop_job", text="", icon="X").index = index
+    row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
         write(layout, job.title if brief else f"{job.title}: {activity(job)}")
 

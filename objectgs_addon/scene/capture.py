@@ -27,6 +27,7 @@ from .kinds import (
     adopt,
     capture_of,
     folder_of,
+    is_linked,
     kind_of,
     link_folder,
     mark,
@@ -73,7 +74,7 @@ def show_capture(
             (
                 child
                 for child in scene.collection.children_recursive
-                if kind_of(child) == RECONSTRUCTION and folder_of(child) == folder
+                if kind_of(child) == RECONSTRUCTION and not is_linked(child) and folder_of(child) == folder
             ),
             None,
         )

@@ -34,8 +34,8 @@ after_edits: list[Callable[[bpy.types.Collection], None]] = []
 """Callbacks that receive a reconstruction's collection after an edit that the backend may have to complete."""
 
 _filling = False
-_unwritten: set[tuple[int, int]] = set()
-"""(session UID of the collection, object ID) of new colors not yet in objects.json."""
+_unwritten: dict[tuple[int, int], set[str]] = {}
+"""(session UID of the collection, object ID) -> "color" or "recolor", which are not yet in objects.json."""
 
 
 @contextmanager
@@ -86,7 +86,8 @@ def store(root: bpy.types.Collection, before: object_list.State) -> None:
 
     What it has not changed is left as it is there, since another scene or program may have written it.
     """
-    _unwritten.difference_update([mark for mark in _unwritten if mark[0] == root.session_uid])
+    for mark in [mark for mark in _unwritten if mark[0] == root.session_uid]:
+        del _unwritten[mark]
     path = Reconstruction(scene.folder_of(root)).objects
     if not folder_trust.is_accepted(root) or not path.exists():
         return
@@ -273,30 +274,41 @@ def notify(root: bpy.types.Collection) -> None:
 
 def flush() -> None:
     """Write pending colors."""
-    waiting = set(_unwritten)
-    if not waiting:
-        return
+    waiting = dict(_unwritten)
     _unwritten.clear()
-    for root in [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]:
+    for root in [root for root in bpy.data.collections if waiting and scene.kind_of(root) == "reconstruction"]:
         if scene.is_linked(root) or not folder_trust.is_accepted(root):
             continue
-        items = [item for item in root.objectgs.objects if (root.session_uid, from_stored(item.object_id)) in waiting]
+        marks = ((item, (root.session_uid, from_stored(item.object_id))) for item in root.objectgs.objects)
+        items = [(item, waiting[mark]) for item, mark in marks if mark in waiting]
         if items:
             _write_colors(root, items)
 
 
-def _write_colors(root: bpy.types.Collection, items: list[Any]) -> None:
-    changes = {from_stored(item.object_id): {"recolor": object_list.recolor_of(item).stored()} for item in items}
+def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]]) -> None:
+    """Write the named colors of rows."""
+    values = {"color": object_list.rgb_of, "recolor": lambda item: object_list.recolor_of(item).stored()}
+    changes = {from_stored(item.object_id): {name: values[name](item) for name in names} for item, names in items}
     try:
         edit_objects(Reconstruction(scene.folder_of(root)).objects, changes)
     except (InputError, OSError) as error:
-        for item in items:
+        for item, _ in items:
             _restore(item)
-            scene.recolor(root, from_stored(item.object_id), object_list.recolor_of(item))
+            _show_colors(item)
         messages.show(f"Colors were not changed: {messages.sentence(error)}", "ERROR")
         return
-    for item in items:
+    for item, _ in items:
         _remember(item)
+    if any("color" in names for _, names in items):
+        _show_written(root)
+
+
+def _show_colors(item: Any) -> None:
+    """Show the colors of a row on its object, without its folder."""
+    root, object_id = item.id_data, from_stored(item.object_id)
+    red, green, blue = object_list.rgb_of(item)
+    scene.show_label(root, object_id, item.name, (red, green, blue))
+    scene.recolor(root, object_id, object_list.recolor_of(item))
 
 
 def _set_sliders(item: Any, recolor: Recolor | None) -> None:
@@ -322,7 +334,12 @@ def name_changed(item: Any, _context: bpy.types.Context) -> None:
 
 
 def color_changed(item: Any, _context: bpy.types.Context) -> None:
-    _row_changed(item, color=object_list.rgb_of(item))
+    """Show a new color immediately and schedule writing it, since it may be dragged."""
+    if _filling:
+        return
+    _show_colors(item)
+    if folder_trust.is_accepted(item.id_data):
+        _write_later(item, "color")
 
 
 def chosen_changed(item: Any, _context: bpy.types.Context) -> None:
@@ -342,13 +359,13 @@ def recolor_changed(item: Any, _context: bpy.types.Context) -> None:
         with without_callbacks():
             item.middle = scene.luma_of(collection)
     scene.recolor(root, object_id, object_list.recolor_of(item))
-    _unwritten.add((root.session_uid, object_id))
-    if bpy.app.background:
-        flush()
-        return
-    if bpy.app.timers.is_registered(_flush_later):
-        bpy.app.timers.unregister(_flush_later)
-    bpy.app.timers.register(_flush_later, first_interval=WRITE_AFTER)
+    _write_later(item, "recolor")
+
+
+def _write_later(item: Any, name: str) -> None:
+    """Write a color of a row once it has not changed for a moment."""
+    _unwritten.setdefault((item.id_data.session_uid, from_stored(item.object_id)), set()).add(name)
+    writing.later(_flush_later, WRITE_AFTER)
 
 
 @writing.allowed
@@ -361,23 +378,26 @@ def _row_changed(item: Any, **changes: Any) -> None:
     if _filling:
         return
     root = item.id_data
-    folder = scene.folder_of(root)
     if not folder_trust.is_accepted(root):
-        red, green, blue = object_list.rgb_of(item)
-        scene.show_label(root, from_stored(item.object_id), item.name, (red, green, blue))
+        _show_colors(item)
         return
     try:
         _require_object_mode(root)
         flush()
-        edit_objects(Reconstruction(folder).objects, {from_stored(item.object_id): changes})
+        edit_objects(Reconstruction(scene.folder_of(root)).objects, {from_stored(item.object_id): changes})
     except (InputError, OSError) as error:
         _restore(item)
         messages.show(f"{item.name} was not changed: {messages.sentence(error)}", "ERROR")
         return
     _remember(item)
+    _show_written(root)
+
+
+def _show_written(root: bpy.types.Collection) -> None:
+    """Show names and colors in the folder on points and in the other scenes."""
     try:
         if object_list.scenes_of(root):
-            scene.show_objects(root, folder)
+            scene.show_objects(root, scene.folder_of(root))
         notify(root)
     except (InputError, OSError) as error:
         messages.show(messages.sentence(error), "ERROR")

@@ -42,7 +42,9 @@ class OpenReconstruction(bpy.types.Operator):
             (
                 collection
                 for collection in context.scene.collection.children_recursive
-                if scene.kind_of(collection) == "reconstruction" and _shows(collection, folder)
+                if scene.kind_of(collection) == "reconstruction"
+                and not scene.is_linked(collection)
+                and _shows(collection, folder)
             ),
             None,
         )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Jobs that operators submit, and the folders of new reconstructions."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,7 +57,8 @@ def folder_to_import_to(chosen: str, default: Callable[[], Path], capture: Path 
     Raises:
         InputError: A job uses the folder, or it contains files that are not of a reconstruction.
     """
-    folder = Path(bpy.path.abspath(chosen)).resolve() if chosen else default()
+    # Without links resolved, as collections of reconstructions store it.
+    folder = Path(os.path.abspath(bpy.path.abspath(chosen))) if chosen else default()  # noqa: PTH100
     need.require_unused(folder)
     Reconstruction(folder).require_own(capture)
     return folder

@@ -27,6 +27,7 @@ class FollowsMouse(InViewport):
     path: CollectionProperty(type=bpy.types.OperatorMousePath, options={"HIDDEN", "SKIP_SAVE"})
 
     _handler: Any
+    _region: bpy.types.Region
     execute: Any
 
     def keeps_path(self, context: bpy.types.Context) -> bool:
@@ -41,6 +42,7 @@ class FollowsMouse(InViewport):
         self.path.clear()
         self._append(context, event)
         self._append(context, event)
+        self._region = context.region
         self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
@@ -82,7 +84,8 @@ class FollowsMouse(InViewport):
         context.area.tag_redraw()
 
     def _draw(self) -> None:
-        draw_line(self.outline([tuple(item.loc) for item in self.path]))
+        if bpy.context.region == self._region:
+            draw_line(self.outline([tuple(item.loc) for item in self.path]))
 
 
 def draw_line(points: Points) -> None:

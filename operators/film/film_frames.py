@@ -3,6 +3,7 @@
 
 import bpy
 
+from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.shot import NAME, write_shot
 from ...objectgs_addon import film, scene
 from ...objectgs_addon.environment import locations
@@ -40,6 +41,8 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
         self.remember_output(context)
         reconstruction = scene.folder_of(root)
         folder = folder_of(owner, reconstruction)
+        if not folder.is_absolute():
+            raise InputError(f"The output folder {folder} is relative; save the .blend first, or choose another folder")
         settings = owner.objectgs_film
         frames = range(owner.frame_start, owner.frame_end + 1, owner.frame_step)
         manager = context.window_manager

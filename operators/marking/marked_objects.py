@@ -90,7 +90,7 @@ class MergeMarked(_OfMarks, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         context.window_manager.invoke_search_popup(self)
-        return {"FINISHED"}
+        return {"INTERFACE"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Choose which objects to reconstruct; the others stay part of the background."""
 
+from collections.abc import Iterable
+
 import bpy
 from bpy.props import EnumProperty
 
@@ -37,10 +39,16 @@ class ChooseObjects(bpy.types.Operator):
         root = need.active_root(context)
         rows = {scene.from_stored(item.object_id): item.chosen for item in root.objectgs.objects}
         active = scene.from_stored(object_list.active_item(root).object_id)
+        targets = {object_id: object_list.merge_target(root, object_id) for object_id in rows}
+
+        def with_merged(chosen: Iterable[int]) -> set[int]:
+            wanted = {targets.get(object_id) for object_id in chosen}
+            return {object_id for object_id, target in targets.items() if target in wanted}
+
         kept = {
             "ALL": set(rows),
-            "ACTIVE": {active},
-            "SELECTED": set(selection.selected_ids(context, root)),
+            "ACTIVE": with_merged([active]),
+            "SELECTED": with_merged(selection.selected_ids(context, root)),
             "INVERT": {object_id for object_id, chosen in rows.items() if not chosen},
         }[self.which] & set(rows)
         if not kept:

@@ -50,7 +50,7 @@ class MergeObjects(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         if not need.objects(cls, context) or not need.idle(cls, context):
             return False
-        if len(need.active_root(context).objectgs.objects) > 1:
+        if sum(not item.is_merged for item in need.active_root(context).objectgs.objects) > 1:
             return True
         cls.poll_message_set("There is only one object")
         return False
@@ -72,7 +72,7 @@ class MergeObjects(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         sources = [object_id for object_id in _sources(context) if str(object_id) != self.into]
-        if not sources:
+        if not sources or not self.into:
             raise InputError("Choose another object to merge into")
         object_edits.merge(need.active_root(context), sources, int(self.into))
 

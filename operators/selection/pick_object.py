@@ -95,7 +95,7 @@ class PickBox(InViewport, bpy.types.Operator):
     top: IntProperty(options=_HIDDEN)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        region = context.region
+        self._region = region = context.region
         self._from = event.mouse_prev_press_x - region.x, event.mouse_prev_press_y - region.y
         self._to = event.mouse_region_x, event.mouse_region_y
         self._handler = bpy.types.SpaceView3D.draw_handler_add(self._draw, (), "WINDOW", "POST_PIXEL")
@@ -138,7 +138,8 @@ class PickBox(InViewport, bpy.types.Operator):
         context.area.tag_redraw()
 
     def _draw(self) -> None:
-        draw_line(rectangle([self._from, self._to]))
+        if bpy.context.region == self._region:
+            draw_line(rectangle([self._from, self._to]))
 
 
 class PointAt(InViewport, bpy.types.Operator):

@@ -11,7 +11,8 @@ class StopJob(bpy.types.Operator):
     bl_idname = "objectgs.stop_job"
     bl_label = "Stop"
     bl_description = (
-        "Stop this job. Training, poses, meshes and film frames go on from there later; other work starts anew"
+        "Stop this job. Training, poses, meshes and film frames go on from there later; other work starts anew. "
+        "Press again to end it by force, without saving"
     )
 
     index: IntProperty(

@@ -641,6 +641,10 @@ def test_film_operators_use_panel_settings(shot_blend, backend_python, registere
     scene.objectgs_film.folder = str(tmp_path / "frames")
     with pytest.raises(RuntimeError, match="no film frames"):
         bpy.ops.objectgs.set_up_compositor()
+    scene.objectgs_film.folder = "frames"
+    with pytest.raises(RuntimeError, match="The output folder frames is relative"):
+        bpy.ops.objectgs.film_frames()
+    scene.objectgs_film.folder = str(tmp_path / "frames")
     camera, scene.camera = scene.camera, None
     assert not bpy.ops.objectgs.film_frames.poll()
     scene.camera = camera

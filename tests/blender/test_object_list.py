@@ -115,6 +115,26 @@ def test_selected_objects_are_merged_and_split(root):
     assert object_list.splat_counts(root) == before and entry(root, first).merged_into is None
 
 
+def test_merged_objects_are_chosen_together(root):
+    first, second = first_ids(root)[:2]
+    activate(root, first)
+    bpy.ops.objectgs.merge_objects(into=str(second))
+    for active in (first, second):
+        activate(root, active)
+        assert bpy.ops.objectgs.choose_objects(which="ACTIVE") == {"FINISHED"}
+        kept = {scene.from_stored(item.object_id) for item in root.objectgs.objects if item.chosen}
+        assert kept == {first, second}
+
+
+def test_the_only_object_is_not_merged(root):
+    first, *others = [scene.from_stored(item.object_id) for item in root.objectgs.objects]
+    for other in others:
+        activate(root, other)
+        bpy.ops.objectgs.merge_objects(into=str(first))
+    activate(root, first)
+    assert not bpy.ops.objectgs.merge_objects.poll()
+
+
 def test_one_object_is_not_merged_into_itself(root):
     first, second = first_ids(root)[:2]
     selection.select_nothing(bpy.context)
