@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import errno
 import functools
 import io
@@ -35,7 +36,8 @@ _UNALLOCATED = ("allocate memory", "DefaultCPUAllocator: not enough memory")
 _LONGEST = 1000
 """Number of characters of an error message; names and paths in it may be longer."""
 _AGAIN, _RESTART = "the same command again", "--restart"
-"""Words of the message of a stop, and the option that would discard what it says is kept."""
+"""Words of the message of a stop, and the option that would discard what it says is kept, once the command has begun
+anew and cleared it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,6 +95,7 @@ def _discard(stream: TextIO) -> None:
 
 def _run(arguments: list[str], reporter: Reporter) -> int:
     stop = StopRequest(announce=reporter.status)
+    options: argparse.Namespace | None = None
     try:
         options = build_parser().parse_args(arguments)
         if refused := use_private_cache():
@@ -114,7 +117,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
         stopped = str(error) or "Stopped immediately."
-        if _RESTART in arguments:
+        if _RESTART in arguments and options is not None and not options.restart:
             stopped = stopped.replace(_AGAIN, f"{_AGAIN} without {_RESTART}")
         _tell(reporter.stopped, stopped)
         return EXIT_CANCELLED
@@ -149,16 +152,22 @@ def _shortened(sentence: str) -> str:
 def _describe_error(error: Exception) -> str | None:
     """Return a sentence for errors due to missing memory, packages or files; None for all other errors."""
     try:
-        from ..raster.devices import is_out_of_memory
+        from ..raster.devices import is_failure, is_out_of_memory
 
-        is_gpu_full = is_out_of_memory(error)
+        is_gpu_full, has_gpu_failed = is_out_of_memory(error), is_failure(error)
     except (ImportError, OSError):
         # The error may be that torch cannot be loaded.
-        is_gpu_full = False
+        is_gpu_full = has_gpu_failed = False
     if is_gpu_full:
         return (
             "The GPU's memory is full; close programs that use it, or try a smaller --max-size or --max-anchors, or "
             "--device cpu. The same command resumes from the last checkpoint."
+        )
+    if has_gpu_failed:
+        first = str(error).strip().partition("\n")[0].rstrip(".")
+        return (
+            f"The GPU failed ({first}); the same command resumes from the last checkpoint, with --device cpu on the "
+            "CPU; `doctor` tests the GPU."
         )
     # torch reports a lack of memory with a RuntimeError, with other words on Windows.
     unallocated = isinstance(error, RuntimeError) and any(words in str(error) for words in _UNALLOCATED)

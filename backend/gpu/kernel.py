@@ -27,6 +27,8 @@ SOURCE = Path(__file__).parent / "source"
 WARP = 32
 
 _FLOAT, _BITS = struct.Struct("<f"), struct.Struct("<I")
+_LIMITS = {"int": 2**31, "long long": 2**63}
+"""Absolute values from which on numbers do not fit into parameters of these types."""
 _FOR_EACH = 128
 """Number of threads per block of kernels without shared memory."""
 _TYPES = {
@@ -139,7 +141,7 @@ class Kernel:
         elif not isinstance(argument, torch.Tensor) and isinstance(kind, str):
             if kind == "float":
                 return int(_BITS.unpack(_FLOAT.pack(argument))[0])
-            if kind in ("int", "long long") and argument == int(argument):
+            if kind in ("int", "long long") and argument == int(argument) and abs(argument) < _LIMITS[kind]:
                 return int(argument)
         what: Any = argument
         if isinstance(argument, torch.Tensor):

@@ -31,8 +31,12 @@ class RenderedView(NamedTuple):
     depth: np.ndarray | None
 
 
+_LEAST_HEIGHT = 16
+"""Height in pixels from which on a part of an image is divided further, where the GPU's memory is full."""
+
+
 def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: bool = False) -> RenderedView:
-    """Render a model over its background.
+    """Render a model over its background, in parts if the GPU's memory is not enough for the whole.
 
     Args:
         model: the model.
@@ -43,6 +47,24 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     Returns:
         The rendered view, as NumPy arrays.
     """
+    try:
+        return _drawn(model, camera, want_ids, want_depth)
+    except Exception as error:
+        if camera.height < 2 * _LEAST_HEIGHT or not devices.is_out_of_memory(error):
+            raise
+    if model.device.type == "cuda":
+        torch.cuda.empty_cache()
+    half = camera.height // 2
+    halves = [
+        draw(model, camera.crop(0, first, camera.width, count), want_ids, want_depth)
+        for first, count in ((0, half), (half, camera.height - half))
+    ]
+    return RenderedView._make(
+        None if planes[0] is None else np.concatenate(planes) for planes in zip(*halves, strict=True)
+    )
+
+
+def _drawn(model: ObjectModel, camera: Camera, want_ids: bool, want_depth: bool) -> RenderedView:
     viewmat, intrinsics = camera.arrays()
     seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
     g = model.generate(seen, camera.center)

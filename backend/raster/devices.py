@@ -19,8 +19,17 @@ CHOICES = ("auto", "cpu", "cuda")
 MIN_FREE_MEMORY = 1e9
 """Bytes of GPU memory that must be free; CUDA itself and torch's libraries use about half of them."""
 
-_OUT_OF_MEMORY_TEXTS = ("CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED")
-"""Error texts of the driver, the CUDA runtime and cuBLAS."""
+_OUT_OF_MEMORY_TEXTS = (
+    "CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "HIP error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED",
+    "HIPBLAS_STATUS_ALLOC_FAILED",
+)  # fmt: skip
+"""Error texts of the driver, the runtime and the library of matrix products, of NVIDIA and AMD."""
+
+_FAILURES = ("CUDA error", "HIP error", "CUDA_ERROR_", "hipError")
+"""Beginnings of error texts of a GPU that failed while it computed."""
+
+_NO_DRIVER = "There is no NVIDIA driver on this computer; install the one for your GPU from nvidia.com."
+_NO_GPU = "The NVIDIA driver shows no GPU that may be used; check nvidia-smi and CUDA_VISIBLE_DEVICES."
 
 CPU = torch.device("cpu")
 
@@ -91,6 +100,19 @@ def is_out_of_memory(error: BaseException) -> bool:
     return isinstance(error, torch.cuda.OutOfMemoryError) or any(words in str(error) for words in _OUT_OF_MEMORY_TEXTS)
 
 
+def is_failure(error: BaseException) -> bool:
+    """Return whether an error of torch or of a kernel means that a GPU has failed while it computed."""
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in _FAILURES)
+
+
+def refused_gpu() -> str | None:
+    """Return why a GPU that this PyTorch could use is not used, as `why_not_cuda`; None without such a GPU."""
+    if emulated() or _problem_with_build():
+        return None
+    reason = why_not_cuda()
+    return None if reason in (_NO_DRIVER, _NO_GPU) else reason
+
+
 @functools.cache
 def why_not_cuda() -> str | None:
     """Explain why CUDA cannot be used on this computer.
@@ -115,7 +137,7 @@ def _problem_with_build() -> str | None:
 def _problem_with_driver() -> str | None:
     try:
         torch.cuda.init()
-    except (RuntimeError, AssertionError) as error:
+    except Exception as error:  # Of several types; for any of them, the CPU can be used instead.
         return explain_cuda_error(str(error), torch.version.cuda)
     return None if torch.cuda.device_count() else explain_cuda_error("No CUDA GPUs are available", torch.version.cuda)
 
@@ -129,20 +151,21 @@ def explain_cuda_error(error: str, toolkit: str | None) -> str:
             "from nvidia.com, or a PyTorch for an older CUDA."
         )
     if "no nvidia driver" in text:
-        return "There is no NVIDIA driver on this computer; install the one for your GPU from nvidia.com."
+        return _NO_DRIVER
     if "no cuda gpus" in text or "no cuda-capable device" in text:
-        return "The NVIDIA driver shows no GPU that may be used; check nvidia-smi and CUDA_VISIBLE_DEVICES."
+        return _NO_GPU
     first = error.strip().partition("\n")[0].rstrip(".") or "no reason was given"
     return f"CUDA does not start on this computer ({first}); restarting it, or a newer NVIDIA driver, may help."
 
 
 def _problem_with_gpu() -> str | None:
-    name = torch.cuda.get_device_name()
+    name = "of this computer"
     try:
+        name = torch.cuda.get_device_name()
         if float(torch.ones(1, device="cuda").sum()) != 1.0:
             return f"The GPU {name} computes wrong results; restart the computer."
         free, total = torch.cuda.mem_get_info()
-    except RuntimeError as error:
+    except Exception as error:  # As above.
         if "no kernel image" in str(error):
             major, minor = torch.cuda.get_device_capability()
             return (

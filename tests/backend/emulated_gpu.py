@@ -102,18 +102,18 @@ def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch)
     scene = as_float32(random_scene(0, count=12))
     pictures = []
     for last in (10_000, 10):
-        monkeypatch.setattr(binning, "_largest_total", {torch.device("cpu"): last})
+        monkeypatch.setattr(binning, "_largest_totals", {torch.device("cpu"): {9: last}})
         pictures.append(draw(scene, camera(), primitive=primitive))
     assert_same_bits(*pictures)
-    needed = binning._largest_total[torch.device("cpu")]
+    needed = binning._largest_totals[torch.device("cpu")][9]
     assert 12 < needed < 10_000 and made == [int(10_000 * 1.125), int(10 * 1.125), needed]
 
 
 def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkeypatch):
-    monkeypatch.setattr(binning, "_largest_total", {})
+    monkeypatch.setattr(binning, "_largest_totals", {})
 
-    def draw_one(count):
-        total = binning.IntersectionCount(torch.tensor([count]))
+    def draw_one(count, tiles=100):
+        total = binning.IntersectionCount(torch.tensor([count]), tiles)
         room = total.expected_capacity()
         assert total.wait() == count
         return room
@@ -123,6 +123,11 @@ def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkey
     for _ in range(500):
         draw_one(10)
     assert draw_one(10) == int(10 * 1.125)
+    assert draw_one(8, tiles=50) == 1, "a part needs less room than the whole, which may not fit"
+    assert draw_one(12, tiles=70) == int(8 * 1.125)
+    for tiles in range(1000, 2000):
+        draw_one(5, tiles)
+    assert len(binning._largest_totals[torch.device("cpu")]) <= binning._MOST_SIZES
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from backend.model.growth import GrowthStatistics, grow_and_prune
 from backend.model.heads import Heads
 from backend.model.object_model import anchors_in_view, first_anchors_in_view
 from backend.raster import Camera, devices, rasterize
-from backend.shared.errors import InputError
+from backend.shared.errors import EXIT_BAD_INPUT, InputError
 from backend.shared.events import Reporter
 from backend.training import step
 from backend.training.budget import Budget
@@ -523,6 +524,31 @@ def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, emulate_g
     assert resumed.progress.step == 3
 
 
+def test_views_are_drawn_in_parts_where_the_memory_is_full(tiny, monkeypatch):
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, SMALL)
+    camera, heights = trainer.scene.camera(0), []
+    whole = draw(trainer.model, camera, want_depth=True)
+
+    def full(*args, **options):
+        heights.append(args[6].height)
+        if args[6].height > 30:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return rasterize(*args, **options)
+
+    monkeypatch.setattr("backend.model.draw.rasterize", full)
+    parts = draw(trainer.model, camera, want_depth=True)
+    assert heights == [48, 24, 24]
+    for plane, right in zip(parts, whole, strict=True):
+        assert plane.shape == right.shape
+        np.testing.assert_allclose(plane, right, atol=1e-4)
+    assert draw(trainer.model, camera, want_ids=False).ids is None
+    tall = SimpleNamespace(height=99)
+    monkeypatch.setattr("backend.model.draw.rasterize", lambda *args, **_: full(*args[:6], tall))
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        draw(trainer.model, camera)
+
+
 def test_other_errors_are_not_treated_as_out_of_memory(tiny, emulate_gpu, monkeypatch):
     emulate_gpu(True)
     capture, ids = tiny()
@@ -576,6 +602,31 @@ def test_torch_errors_are_explained(error, part):
 def test_out_of_memory_errors_are_recognized(error):
     assert devices.is_out_of_memory(RuntimeError(error))
     assert not devices.is_out_of_memory(RuntimeError("CUDA error: an illegal memory access was encountered"))
+
+
+def test_a_gpu_that_fails_ends_a_command_with_a_sentence(run_command, monkeypatch, tmp_path):
+    def fail(*_):
+        raise RuntimeError("CUDA error: an illegal memory access was encountered\nCompile with ...")
+
+    monkeypatch.setattr("backend.commands.capture.check.check", fail)
+    result = run_command("check", tmp_path)
+    assert result.code == EXIT_BAD_INPUT
+    assert "The GPU failed (CUDA error: an illegal memory access was encountered); the same" in result.err
+
+
+def test_only_a_gpu_that_is_there_is_refused_with_a_reason(monkeypatch):
+    monkeypatch.setattr(devices, "emulated", lambda: False)
+    monkeypatch.setattr(devices, "_problem_with_build", lambda: None)
+    for text, is_there in (
+        ("No CUDA GPUs are available", False),
+        ("Found no NVIDIA driver on your system.", False),
+        ("The NVIDIA driver on your system is too old", True),
+    ):
+        reason = devices.explain_cuda_error(text, "13.0")
+        monkeypatch.setattr(devices, "why_not_cuda", lambda reason=reason: reason)
+        assert devices.refused_gpu() == (reason if is_there else None)
+    monkeypatch.setattr(devices, "_problem_with_build", lambda: "built without CUDA")
+    assert devices.refused_gpu() is None
 
 
 def test_low_memory_is_explained_with_figures():

@@ -28,8 +28,8 @@ from .kernels import path_beside_kernels
 
 _ROOT = Path(__file__).parents[3]
 _TEST = (sys.executable, "-m", "backend.commands.setup.self_test")
-_LONGEST, _POLLED_EVERY = 900.0, 0.3
-"""Seconds after which the test has failed, as it compiles kernels, too, and between two looks at it."""
+_LONGEST, _POLLED_EVERY, _ENDS_WITHIN = 900.0, 0.3, 10.0
+"""Seconds after which the test has failed, as it compiles kernels, too, between two looks at it, and for its end."""
 _OUT_OF_MEMORY = re.compile("out.of.memory", re.IGNORECASE)
 
 
@@ -50,11 +50,13 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
     """
     device = devices.pick(requested)
     if device.type == "cpu":
+        if requested == "auto" and (reason := devices.refused_gpu()):
+            reporter.warning(f"{reason} Until then, the CPU is used.")
         return device
     problem = None if again else _known_problem(device)
     if problem is None:
         reporter.status(f"Testing {devices.name_of(device)}, once")
-        problem = _test(reporter)
+        problem = _test(device, reporter)
         # Other programs may have used the memory. Without a writable folder, the next command tests again, too.
         if not _OUT_OF_MEMORY.search(problem):
             with contextlib.suppress(OSError):
@@ -63,8 +65,8 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
         return device
     failure = f"{devices.name_of(device)} fails a test ({problem})"
     if requested == "cuda":
-        raise InputError(f"{failure}; choose --device cpu, or install a newer driver from nvidia.com.")
-    reporter.warning(f"{failure}, so the CPU is used; a newer driver from nvidia.com may help.")
+        raise InputError(f"{failure}; choose --device cpu, or install a newer driver of the GPU.")
+    reporter.warning(f"{failure}, so the CPU is used; a newer driver of the GPU may help.")
     return devices.CPU
 
 
@@ -92,14 +94,14 @@ def _driver() -> str:
     return ""
 
 
-def _test(reporter: Reporter) -> str:
-    """Test the GPU in a process of its own, and return its problem, for a sentence; "" if there is none."""
+def _test(device: torch.device, reporter: Reporter) -> str:
+    """Test a GPU in a process of its own, and return its problem, for a sentence; "" if there is none."""
     with tempfile.TemporaryDirectory(prefix="objectgs-device-", ignore_cleanup_errors=True) as scratch:
-        errors = Path(scratch) / "errors.txt"
-        with errors.open("wb") as stream:
+        printed, errors = Path(scratch) / "printed.txt", Path(scratch) / "errors.txt"
+        with printed.open("wb") as output, errors.open("wb") as stream:
             process = subprocess.Popen(
-                [*_TEST, str(Path(scratch) / "files")], cwd=_ROOT,
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=stream,
+                [*_TEST, str(Path(scratch) / "files"), str(device.index or 0)], cwd=_ROOT,
+                stdin=subprocess.DEVNULL, stdout=output, stderr=stream,
             )  # fmt: skip
             try:
                 until = time.monotonic() + _LONGEST
@@ -112,8 +114,10 @@ def _test(reporter: Reporter) -> str:
                 reporter.progress(0, 1)
             finally:
                 process.kill()
-                printed, _ = process.communicate()
+                # A driver that blocks keeps the process from ending.
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=_ENDS_WITHIN)
         with contextlib.suppress(ValueError, IndexError, KeyError, TypeError):
-            return str(json.loads(printed.splitlines()[-1])["problem"])
+            return str(json.loads(printed.read_bytes().splitlines()[-1])["problem"])
         lines = errors.read_text(errors="replace").strip().splitlines()
         return lines[-1].strip().rstrip(".") if lines else f"it ended with exit code {process.returncode}"

@@ -23,7 +23,9 @@ _SPARE, _DECAY = 1.125, 0.99
 """Ratio of the capacity to the largest number of intersections in the last images, and the factor by which a number
 counts less for each image after it."""
 
-_largest_total: dict[torch.device, float] = {}
+_largest_totals: dict[torch.device, dict[int, float]] = {}
+"""Device -> number of tiles of an image -> the largest number of intersections in the last images of that size."""
+_MOST_SIZES = 256
 
 
 @dataclass
@@ -82,8 +84,9 @@ def depth_order(splats: torch.Tensor, outlines: torch.Tensor, ids: torch.Tensor,
 class IntersectionCount:
     """The number of intersections, copied to the host asynchronously."""
 
-    def __init__(self, cumulative: torch.Tensor) -> None:
-        self._device = cumulative.device
+    def __init__(self, cumulative: torch.Tensor, tiles: int) -> None:
+        """Begin to copy the last of the (N,) sums `cumulative`, for an image of this number of tiles."""
+        self._device, self._tiles = cumulative.device, tiles
         self._event = None
         self._host = torch.zeros(1, dtype=torch.int64)
         if self._device.type == "cuda" and cumulative.numel():
@@ -95,15 +98,25 @@ class IntersectionCount:
             self._host = cumulative[-1:]
 
     def expected_capacity(self) -> int:
-        """Return the capacity to use before the number is available."""
-        return max(int(_largest_total.get(self._device, 0) * _SPARE), 1)
+        """Return the capacity to use before the number is available.
+
+        It does not follow from larger images, whose room for intersections may be what does not fit.
+        """
+        known = _largest_totals.get(self._device, {})
+        total = known.get(self._tiles)
+        if total is None:
+            total = max((total for tiles, total in known.items() if tiles < self._tiles), default=0)
+        return max(int(total * _SPARE), 1)
 
     def wait(self) -> int:
         """Wait for the number of intersections and return it."""
         if self._event is not None:
             self._event.synchronize()
         total = int(self._host.numpy()[0])
-        _largest_total[self._device] = max(total, _DECAY * _largest_total.get(self._device, 0))
+        known = _largest_totals.setdefault(self._device, {})
+        if len(known) >= _MOST_SIZES and self._tiles not in known:
+            known.clear()
+        known[self._tiles] = max(total, _DECAY * known.get(self._tiles, 0))
         return total
 
 

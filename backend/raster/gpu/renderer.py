@@ -13,6 +13,9 @@ from .binning import IntersectionCount, Intersections, depth_order, grid, tile_i
 from .ids import most_probable
 from .kernels import SPLATS_PER_BLOCK, THREADS, raster_kernel
 
+_MOST_INTERSECTIONS = 2**31 - 1
+"""Largest number that torch sorts at once."""
+
 
 @dataclass
 class Gaussians:
@@ -80,8 +83,8 @@ def forward(
         outlines if flat else None,
     )  # fmt: skip
     order = depth_order(splats, outlines, g.ids, width, height)
-    total = IntersectionCount(order.cumulative)
     columns, lines = grid(width, height)
+    total = IntersectionCount(order.cumulative, columns * lines)
 
     def planes(wanted: bool, *shape: int) -> torch.Tensor | None:
         return torch.empty((*shape, height, width), device=device) if wanted else None
@@ -106,6 +109,8 @@ def forward(
         needed = total.wait()
         if needed <= capacity:
             break
+        if needed > _MOST_INTERSECTIONS:
+            raise torch.cuda.OutOfMemoryError(f"{needed} intersections of tiles and splats are too many to be sorted")
         capacity = needed
     return Frame(
         g, camera, labels, color, transmittance, label_probability, depth, median, normals, moments, splats, tilts,

@@ -6,7 +6,9 @@
 
 #define UNSEEN 0x7fffffffffffffffLL
 
+// Of values beyond any image, the nearest that an int can hold.
 DEVICE int floor_of(float x) {
+    x = MIN(MAX(x, -1e9f), 1e9f);
     int whole = (int)x;
     return (float)whole > x ? whole - 1 : whole;
 }
