@@ -48,10 +48,9 @@ class Files:
         """List the files of `folder`, without those in its subfolders `without`."""
         self.folder = folder
         self.paths: list[str] = []
-        seen = {os.path.realpath(folder)}
         for parent, folders, names in os.walk(folder, followlinks=True):
             inside = sorted(name for name in folders if name not in without or parent != str(folder))
-            folders[:] = [name for name in inside if _is_new(Path(parent) / name, seen)]
+            folders[:] = [name for name in inside if not _leads_back(Path(parent) / name)]
             within = Path(parent).relative_to(folder)
             self.paths += [(within / name).as_posix() for name in sorted(names) if not name.startswith(".")]
         self._levels: list[dict[str, list[str]]] = []
@@ -76,12 +75,9 @@ class Files:
         return next((path for name in names if (path := self.find(name)) is not None), None)
 
 
-def _is_new(folder: Path, seen: set[str]) -> bool:
-    """Return whether a folder was not seen before, by another link, and remember it."""
-    place = os.path.realpath(folder)
-    is_new = place not in seen
-    seen.add(place)
-    return is_new
+def _leads_back(folder: Path) -> bool:
+    """Return whether a folder is a link to one that it is in."""
+    return folder.is_symlink() and folder.parent.resolve().is_relative_to(folder.resolve())
 
 
 def _folded(name: str, level: int) -> str:

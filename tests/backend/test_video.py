@@ -447,16 +447,41 @@ def test_photos_are_turned_if_their_masks_are_upright(tmp_path, upright):
             assert read_mask(tmp_path / "capture" / "masks" / f"{name}.png").shape == image.size[::-1]
 
 
-def test_photos_with_known_cameras_are_not_turned(tmp_path):
+def test_photos_with_known_lenses_are_turned_as_those(tmp_path):
     folder = tmp_path / "trip"
     folder.mkdir()
     for name in ("a.jpg", "b.jpg"):
         heic(folder / name, orientation=6)
-    for as_stored in (False, True):
-        capture = tmp_path / f"capture {as_stored}"
-        taken = photos.take_photos([folder], capture, None, reporter(), as_stored)
-        assert taken.photos[0].size == ("160x120" if as_stored else "120x160")
-        assert ((capture / "images" / "a.jpg").read_bytes() == (folder / "a.jpg").read_bytes()) == as_stored
+    for number, (lenses, turned) in enumerate([((), True), ({(160, 120)}, False), ({(120, 160)}, True)]):
+        capture = tmp_path / str(number)
+        taken = photos.take_photos([folder], capture, None, reporter(), lenses)
+        assert taken.photos[0].size == ("120x160" if turned else "160x120")
+        assert ((capture / "images" / "a.jpg").read_bytes() == (folder / "a.jpg").read_bytes()) != turned
+
+
+@pytest.mark.parametrize(("masks", "lenses"), [(False, ()), (False, {(160, 120)}), (True, ())])
+def test_names_that_colmap_cannot_read(tmp_path, monkeypatch, masks, lenses):
+    """On Windows: copies get others, unless masks are found by them."""
+    monkeypatch.setattr(photos, "_READS_ALL_NAMES", False)
+    folder = tmp_path / "trip"
+    for part in ("images", *(["masks"] if masks else [])):
+        (folder / part).mkdir(parents=True)
+    for name in ("Straße", "b", "c"):
+        heic(folder / "images" / f"{name}.jpg", orientation=6)
+        if masks:
+            Image.new("L", (120, 160), 1).save(folder / "masks" / f"{name}.png")
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter(), lenses)
+    assert len(taken.photos) == (2 if masks else 3) and all(photo.name.isascii() for photo in taken.photos)
+    assert list(taken.unreadable) == (["Straße.jpg"] if masks else [])
+
+
+def test_a_photo_beside_a_video_of_its_name_is_no_live_photo(tmp_path):
+    heic(tmp_path / "room.jpg")
+    write_video(tmp_path / "room.mp4", pan(12))
+    (tmp_path / "capture" / "sfm").mkdir(parents=True)
+    chosen = [tmp_path / "room.jpg", tmp_path / "room.mp4"]
+    taken = photos.take_photos(chosen, tmp_path / "capture", 3, reporter())
+    assert len(taken.photos) == 4
 
 
 def test_panoramas_are_left_out(tmp_path):

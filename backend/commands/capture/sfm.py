@@ -143,9 +143,8 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
-    photos, unreadable, in_order = take_photos(
-        made_from.photos, capture, made_from.frames, reporter, as_stored=made_from.calibration is not None
-    )
+    lenses = () if made_from.calibration is None else read_calibration(made_from.calibration)
+    photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter, lenses)
     if are_copied(made_from.photos, capture):
         source = images
     else:

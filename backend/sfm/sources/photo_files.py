@@ -124,17 +124,15 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
         InputError: it cannot be read.
     """
     suffix = path.suffix.lower()
-    is_heic = suffix not in RAW and _format_of(path) in _HEIC_FORMATS
-    is_kept = is_read_by_colmap(path)
-    target = target if is_kept else target.with_suffix(".jpg" if is_heic else ".png")
+    target = path_of_copy(path, target)
     if target.exists() and not again:
         return target
     make_folder(target.parent)
     if suffix in RAW:
         write_image(target, _developed(path), _lens_data(path))
-    elif is_heic:
+    elif _is_heic(path):
         write_atomic(target, _as_jpeg(path, lambda image: image))
-    elif not is_kept:
+    elif not is_read_by_colmap(path):
         write_image(target, read_image(path))
     elif turn and suffix in (".jpg", ".jpeg") and _is_turned(path):
         write_atomic(target, _as_jpeg(path, ImageOps.exif_transpose))
@@ -142,6 +140,15 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
         with atomic_path(target) as part:
             shutil.copyfile(path, part)
     return target
+
+
+def path_of_copy(path: Path, target: Path) -> Path:
+    """Return the path that the copy of a photo has, given the one that it would have if it is not converted."""
+    return target if is_read_by_colmap(path) else target.with_suffix(".jpg" if _is_heic(path) else ".png")
+
+
+def _is_heic(path: Path) -> bool:
+    return path.suffix.lower() not in RAW and _format_of(path) in _HEIC_FORMATS
 
 
 def is_read_by_colmap(path: Path) -> bool:

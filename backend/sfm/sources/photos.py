@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,7 +94,11 @@ class Taken(NamedTuple):
 
 
 def take_photos(
-    sources: Sequence[Path], capture: Path, frames: int | None, reporter: StoppingReporter, as_stored: bool = False
+    sources: Sequence[Path],
+    capture: Path,
+    frames: int | None,
+    reporter: StoppingReporter,
+    lenses: Collection[tuple[int, int]] = (),
 ) -> Taken:
     """Copy photos and frames of videos to the images/ of a capture, unless they are there.
 
@@ -106,8 +110,7 @@ def take_photos(
         capture: the capture's folder.
         frames: wanted number of frames of each video; None: by its motion.
         reporter: receives progress and warnings.
-        as_stored: whether photos are not turned as their EXIF orientation says, since what is known of their cameras is
-            about the pixels as they are stored.
+        lenses: sizes (width, height) of the photos whose lenses are known, for which they are turned or not.
 
     Raises:
         InputError: There are fewer than two photos, or too little space on the disk.
@@ -120,12 +123,15 @@ def take_photos(
         base = source / IMAGES if (source / IMAGES).is_dir() else source
         found = _listed(base, capture)
     else:
-        found = _without_doubles(path.absolute() for path in sources)
+        given = [path.absolute() for path in sources]
+        found = _without_doubles(given)
+        if sum(path.suffix.lower() in PHOTOS for path in found) < 2:
+            found = _in_order(given)  # A single photo beside a video of its name is no Live Photo.
         try:
             base = Path(os.path.commonpath([path.parent for path in found]))
         except ValueError as error:
             raise InputError(f"{found[0]} and {found[-1]} are on two disks; copy the photos to one folder.") from error
-    found, masks_beside = _without_masks(found)
+    found, are_beside = _without_masks(found)
     is_alone = len(found) == 1 and not source.is_dir()
     in_place = base.resolve() == (capture / IMAGES).resolve()
     videos = [] if in_place else [path for path in found if path.suffix.lower() in VIDEOS]
@@ -136,9 +142,18 @@ def take_photos(
     if not in_place:
         copies = ((path, capture / IMAGES / _readable(path.relative_to(base))) for path in files)
         _require_space([path for path, copy in copies if not _is_copied(copy)], capture)
-    turn = not in_place and not as_stored and _are_upright(base, source, files, bool(masks_beside))
+    has_masks = are_beside or (source / MASKS).is_dir()
+    if has_masks:
+        masks_there = Files(base if are_beside else source / MASKS)
+        turn = _are_upright(files, lambda path: _mask_size(masks_there, path.relative_to(base), are_beside))
+    elif lenses:
+        turn = _are_upright(files, lambda path: _lens_size(lenses, image_size(path)))
+    else:
+        turn = True
+    turn = turn and not in_place
     photos, unreadable = [], {}
     names: dict[str, str] = {}
+    taken_names: set[str] = set()
     stamps = _Stamps(capture)
     for number, path in enumerate(files):
         reporter.progress(number, len(files))
@@ -154,16 +169,19 @@ def take_photos(
                     f"{path.name} is {projection}, which no pinhole camera takes; cut it into perspective images first."
                 )
             copy = _readable(relative)
-            if copy != relative and (in_place or not turn):
+            if copy != relative and (in_place or has_masks):
                 raise InputError(f"{path.name} is a name that COLMAP cannot read on Windows; use plain letters.")
+            if not in_place:
+                copy = photo_files.path_of_copy(path, copy)
+                if copy.as_posix() in taken_names:
+                    raise InputError(f"{path.name} has the name of another photo once it is converted; rename it.")
+                taken_names.add(copy.as_posix())
             is_changed = not from_copies and stamps.has_changed(name, path, turn)
             if is_changed:
                 database.remove_all(capture / WORK)
             if not in_place:
                 copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
                 relative = copied.relative_to(capture / IMAGES)
-                if relative.as_posix() in names.values():
-                    raise InputError(f"{path.name} has the name of another photo once it is converted; rename it.")
                 if is_raw:
                     camera = photo_files.camera_of(copied, False)
             photos.append(Photo(relative.as_posix(), f"{Path(name).parent} {camera}", camera.split(" ")[0]))
@@ -192,7 +210,7 @@ def take_photos(
             _copy_rest(source, capture, stamps)
         masks = MaskFiles(source / MASKS, names, base)
         _write_masks(masks, masks.lossy, names, capture, stamps)
-    if masks_beside:
+    if are_beside:
         masks = MaskFiles(base, names, base)
         _write_masks(masks, masks.photos, names, capture, stamps)
     stamps.write()
@@ -217,31 +235,41 @@ def _readable(relative: Path) -> Path:
     return Path("".join(letters))
 
 
-def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], set[str]]:
-    """Return the photos and videos without those that are masks of others beside them, and the names of these."""
+def _without_masks(paths: Sequence[Path]) -> tuple[list[Path], bool]:
+    """Return the photos and videos without those that are masks of others beside them, and whether there are masks."""
     known = {path.as_posix().casefold() for path in paths}
     candidates = (name.casefold() for path in paths for names in mask_names(path.as_posix(), True) for name in names)
     masks = known & set(candidates)
-    return [path for path in paths if path.as_posix().casefold() not in masks], masks
+    return [path for path in paths if path.as_posix().casefold() not in masks], bool(masks)
 
 
-def _are_upright(base: Path, source: Path, files: Sequence[Path], are_beside: bool) -> bool:
-    """Return whether photos are to be turned as their EXIF orientation says: if they have no masks, or upright ones.
+def _are_upright(photos: Sequence[Path], size_for: Callable[[Path], tuple[int, int] | None]) -> bool:
+    """Return whether photos are to be turned as their EXIF orientation says.
 
-    Other masks fit the pixels as they are stored. The first photo that is turned by a right angle decides.
+    The first one that is turned by a right angle, and for which a size is known, decides.
+
+    Args:
+        photos: the photos.
+        size_for: returns the width and height that a photo must have, up to a factor; None if it does not matter.
     """
-    folder = base if are_beside else source / MASKS
-    if not are_beside and not folder.is_dir():
-        return True
-    masks = Files(folder)
-    for path in files:
-        accepted, lossy = mask_names(path.relative_to(base).as_posix(), are_beside)
-        mask = masks.first(accepted) or masks.first(lossy)
+    for path in photos:
         with suppress(InputError):
-            if mask is not None and photo_files.is_turned_by_right_angle(path):
+            if photo_files.is_turned_by_right_angle(path) and (wanted := size_for(path)) is not None:
                 size = image_size(path)
-                return not same_shape(mask_size(mask), size) and same_shape(mask_size(mask), size[::-1])
+                return not same_shape(wanted, size) and same_shape(wanted, size[::-1])
     return False
+
+
+def _mask_size(masks: Files, photo: Path, are_beside: bool) -> tuple[int, int] | None:
+    """Return the size of a photo's mask, None without one."""
+    accepted, lossy = mask_names(photo.as_posix(), are_beside)
+    found = masks.first(accepted) or masks.first(lossy)
+    return None if found is None else mask_size(found)
+
+
+def _lens_size(lenses: Collection[tuple[int, int]], size: tuple[int, int]) -> tuple[int, int] | None:
+    """Return the size of the lens that fits a photo as it is stored, or else turned; None without one."""
+    return next((each for each in (size, size[::-1]) if each in lenses), None)
 
 
 def _write_masks(
@@ -327,7 +355,11 @@ def _without_doubles(found: Iterable[Path]) -> list[Path]:
         others = photos if suffix in VIDEOS else developed if suffix in photo_files.RAW else copied
         return suffix not in photo_files.COPIED and path.with_suffix("") in others
 
-    return sorted((path for path in paths if not is_double(path)), key=lambda path: natural_order(path.as_posix()))
+    return _in_order(path for path in paths if not is_double(path))
+
+
+def _in_order(paths: Iterable[Path]) -> list[Path]:
+    return sorted(set(paths), key=lambda path: natural_order(path.as_posix()))
 
 
 def _is_copied(copy: Path) -> bool:
