@@ -84,11 +84,11 @@ def _others(owner: bpy.types.Scene) -> bool:
 
 
 def _must_wait(active: bpy.types.Collection | None, jobs: list[tuple[int, Job]]) -> bool:
-    """Return whether the next step must wait for a job: of the same reconstruction, or the set-up of the backend."""
+    """Return whether the next step must wait for a job: of the same reconstruction or capture, or the set-up."""
     if active is None:
         return bool(jobs)
-    folder = scene.folder_of(active)
-    return background.is_busy(active) or any(job.kind == "setup" or job.folder == folder for _, job in jobs)
+    folders = {scene.folder_of(active), folder_trust.state_of(active).capture}
+    return background.is_busy(active) or any(job.kind == "setup" or job.folder in folders for _, job in jobs)
 
 
 def draw_message(layout: bpy.types.UILayout) -> None:

@@ -21,8 +21,17 @@ _before: dict[int, object_list.State] = {}
 
 
 @bpy.app.handlers.persistent
+@writing.allowed
+def _leaving(*_: Any) -> None:
+    """Write pending colors before another .blend is opened."""
+    object_edits.flush()
+
+
+@bpy.app.handlers.persistent
+@writing.allowed
 def _undoing(*_: Any) -> None:
-    """Remember what undo or redo may change."""
+    """Write pending colors, and remember what undo or redo may change."""
+    object_edits.flush()
     _before.clear()
     _before.update({root.session_uid: object_list.state_of(root) for root in _accepted_roots()})
 
@@ -86,6 +95,7 @@ def _file_loaded(*_: Any) -> None:
 
 def register() -> None:
     object_edits.after_edits.append(background.fill_holes)
+    bpy.app.handlers.load_pre.append(_leaving)
     bpy.app.handlers.load_post.append(_file_loaded)
     bpy.app.handlers.save_pre.append(_saving)
     for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
@@ -101,5 +111,6 @@ def unregister() -> None:
         handlers.remove(_undoing)
     bpy.app.handlers.save_pre.remove(_saving)
     bpy.app.handlers.load_post.remove(_file_loaded)
+    bpy.app.handlers.load_pre.remove(_leaving)
     object_edits.after_edits.remove(background.fill_holes)
     background.stop()

@@ -159,7 +159,8 @@ def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collec
     """Map the IDs of objects with duplicates to the duplicates' collections, in Blender's order."""
     inside = [collection for collection in root.children_recursive if kind_of(collection) == DUPLICATE]
     found: dict[int, list[bpy.types.Collection]] = {}
-    for collection in [*inside, *_moved_out(root, DUPLICATE, inside)]:
+    # One that the user unlinked is in no scene.
+    for collection in [*inside, *(each for each in _moved_out(root, DUPLICATE, inside) if each.users)]:
         found.setdefault(object_id_of(collection) or 0, []).append(collection)
     return found
 

@@ -294,7 +294,8 @@ def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]])
     except (InputError, OSError) as error:
         for item, _ in items:
             _restore(item)
-            _show_colors(item)
+            _show_label(item)
+            scene.recolor(root, from_stored(item.object_id), object_list.recolor_of(item))
         messages.show(f"Colors were not changed: {messages.sentence(error)}", "ERROR")
         return
     for item, _ in items:
@@ -303,12 +304,10 @@ def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]])
         _show_written(root)
 
 
-def _show_colors(item: Any) -> None:
-    """Show the colors of a row on its object, without its folder."""
-    root, object_id = item.id_data, from_stored(item.object_id)
+def _show_label(item: Any) -> None:
+    """Show the name and the color of a row on its object, without its folder."""
     red, green, blue = object_list.rgb_of(item)
-    scene.show_label(root, object_id, item.name, (red, green, blue))
-    scene.recolor(root, object_id, object_list.recolor_of(item))
+    scene.show_label(item.id_data, from_stored(item.object_id), item.name, (red, green, blue))
 
 
 def _set_sliders(item: Any, recolor: Recolor | None) -> None:
@@ -326,6 +325,7 @@ def name_changed(item: Any, _context: bpy.types.Context) -> None:
         return
     name = " ".join(item.name.split())
     if not name:
+        flush()
         _restore(item)
         return
     with without_callbacks():
@@ -337,7 +337,7 @@ def color_changed(item: Any, _context: bpy.types.Context) -> None:
     """Show a new color immediately and schedule writing it, since it may be dragged."""
     if _filling:
         return
-    _show_colors(item)
+    _show_label(item)
     if folder_trust.is_accepted(item.id_data):
         _write_later(item, "color")
 
@@ -379,11 +379,11 @@ def _row_changed(item: Any, **changes: Any) -> None:
         return
     root = item.id_data
     if not folder_trust.is_accepted(root):
-        _show_colors(item)
+        _show_label(item)
         return
+    flush()
     try:
         _require_object_mode(root)
-        flush()
         edit_objects(Reconstruction(scene.folder_of(root)).objects, {from_stored(item.object_id): changes})
     except (InputError, OSError) as error:
         _restore(item)

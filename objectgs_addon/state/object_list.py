@@ -40,11 +40,16 @@ def shown_item(root: bpy.types.Collection) -> Any:
 
 def merge_target(root: bpy.types.Collection, object_id: int) -> int:
     """Return the ID of the object into which `object_id` is merged, or `object_id` itself."""
+    return merge_targets(root).get(object_id, object_id)
+
+
+def merge_targets(root: bpy.types.Collection) -> dict[int, int]:
+    """Map the IDs of all rows to those of the objects into which they are merged, or to themselves."""
     into = {
         from_stored(item.object_id): from_stored(item.merged_into) if item.is_merged else None
         for item in root.objectgs.objects
     }
-    return follow_merges(into).get(object_id, object_id)
+    return follow_merges(into)
 
 
 def chosen_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:

@@ -42,7 +42,9 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
         reconstruction = scene.folder_of(root)
         folder = folder_of(owner, reconstruction)
         if not folder.is_absolute():
-            raise InputError(f"The output folder {folder} is relative; save the .blend first, or choose another folder")
+            raise InputError(
+                f"The output folder {folder} is relative, or without a drive; save the .blend first, or choose another"
+            )
         settings = owner.objectgs_film
         frames = range(owner.frame_start, owner.frame_end + 1, owner.frame_step)
         manager = context.window_manager

@@ -39,7 +39,7 @@ class ChooseObjects(bpy.types.Operator):
         root = need.active_root(context)
         rows = {scene.from_stored(item.object_id): item.chosen for item in root.objectgs.objects}
         active = scene.from_stored(object_list.active_item(root).object_id)
-        targets = {object_id: object_list.merge_target(root, object_id) for object_id in rows}
+        targets = object_list.merge_targets(root)
 
         def with_merged(chosen: Iterable[int]) -> set[int]:
             wanted = {targets.get(object_id) for object_id in chosen}

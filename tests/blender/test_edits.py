@@ -760,7 +760,7 @@ def test_exported_meshes_have_edits(root, tmp_path, suffix):
         places = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], float)
         expected = read_mesh(blender_scene.folder_of(root) / "meshes" / "1.ply").vertices
         assert len(places) == 12 and places[:4] == pytest.approx(expected, abs=1e-3)
-        assert all(path.name.startswith("all ") for path in tmp_path.glob("*.png"))
+        assert all(path.name.startswith("all_") for path in tmp_path.glob("*.png"))
         assert "map_Kd" in (tmp_path / "all.mtl").read_text()
         texture = next(tmp_path.glob("*recolored*.png"))
         image = bpy.data.images.load(str(texture))

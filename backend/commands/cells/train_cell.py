@@ -50,6 +50,7 @@ def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             write_part_record(folder, record)
             if (folder / CHECKPOINT).exists():
                 shutil.rmtree(folder / CHECKPOINT)
+        options.restart = False  # The same command would discard what is trained from now on.
         trainer = _open(divided, number, options, reporter)
         if budget.progress(trainer.progress) >= 1:
             reporter.status(

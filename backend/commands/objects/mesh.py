@@ -80,6 +80,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         waiting = [target.key for target in wanted]
         if wanted or interrupted:
             write_meshes(folder.meshes, _known_meshes(folder), trained.progress.step, waiting)
+        options.restart = False  # The same command would begin again.
         discs = seconds_of_discs(trained) if wanted else 0.0
         reporter.expect({DISCS: ("Fitting discs", discs), "meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
         model = model_of_discs(trained, options, reporter) if wanted else trained.model

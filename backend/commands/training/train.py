@@ -208,6 +208,7 @@ def _begin(
         # The new training's first checkpoint replaces that of the old one before anything refers to it.
         trainer.save(folder.checkpoint)
         (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
+        options.restart = False  # The same command would discard it.
     if not resuming:
         outdate_results(folder)
     change_objects(folder, voters, options)

@@ -96,15 +96,18 @@ def with_own_textures(
     _recolor_textures(copy, None)
     for node in [node for node in copy.node_tree.nodes if node.type == "TEX_IMAGE" and kind_of(node.image) == TEXTURE]:
         source = node.image
+        if not source.size[0]:
+            continue  # Its file is missing.
         pixels = np.empty(4 * source.size[0] * source.size[1], np.float32)
         source.pixels.foreach_get(pixels)
         if recolor is not None:
             matrix, offset = recolor.affine()
             colors = pixels.reshape(-1, 4)
             colors[:, :3] = np.clip(colors[:, :3] @ matrix.T + offset, 0.0, 1.0)
-        image = bpy.data.images.new(source.name if recolor is None else f"{source.name} recolored", *source.size)
+        image = bpy.data.images.new(source.name, *source.size)
         image.pixels.foreach_set(pixels)
-        image.filepath_raw = str(folder / f"{prefix}{bpy.path.clean_name(image.name)}.png")
+        stem = bpy.path.clean_name(source.name if recolor is None else f"{source.name} recolored")
+        image.filepath_raw = str(folder / f"{prefix}{stem}.png")
         image.file_format = "PNG"
         image.save()
         image.source = "FILE"

@@ -17,6 +17,7 @@ from ....backend.shared.formats.file_names import distinct_stems
 from ....backend.shared.reconstruction.folder import Reconstruction
 from ... import scene
 from ...blender.quiet import quiet
+from ..object_collection import our_materials
 from .shading import lit
 
 _EXPORTERS = {"glb": (bpy.ops.export_scene, "gltf"), "usdc": (bpy.ops.wm, "usd_export")}
@@ -69,6 +70,9 @@ def export(
         files = {out / f"{stem}.{suffix}": [object_id] for object_id, stem in stems.items()}
     for path in files:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
+    if in_capture:
+        parts_of_all = (part for object_id in chosen for part in scene.parts_of(collections[object_id]))
+        _require_near(root, [part for part in parts_of_all if scene.kind_of(part) == "mesh"])
     for path, those in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         parts = [
@@ -78,10 +82,8 @@ def export(
             for mesh in scene.parts_of(collection)
             if scene.kind_of(mesh) == "mesh"
         ]
-        if in_capture:
-            _require_near(root, [mesh for _, mesh in parts])
         # Other formats than GLB have textures beside them, where those of another file must not be replaced.
-        prefix = "" if suffix == "glb" else f"{path.stem} "
+        prefix = "" if suffix == "glb" else f"{bpy.path.clean_name(path.stem)}_"
         with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, prefix):
             _write(path, suffix, in_capture)
     return list(files)
@@ -137,7 +139,8 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
         for region in (space.region_3d, *space.region_quadviews)
     ]
     stage = bpy.data.scenes.new("ObjectGS export")
-    made, copies = [], {}
+    made: list[bpy.types.Object] = []
+    copies: dict[bpy.types.Material, tuple[bpy.types.Material, list[bpy.types.Image], str]] = {}
     try:
         with tempfile.TemporaryDirectory() as folder:
             for collection, mesh in parts:
@@ -149,12 +152,17 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                 obj.matrix_basis = Matrix(place.tolist())
                 obj.hide_viewport = obj.hide_render = False
                 stage.collection.objects.link(obj)
+                recolor, ours = scene.recolor_of(collection), our_materials(mesh)
                 for slot, own in zip(obj.material_slots, mesh.material_slots):
                     material = own.material
-                    recolor = scene.recolor_of(collection)
-                    if material is not None and (prefix or recolor is not None):
+                    if material in ours and (prefix or recolor is not None):
                         if material not in copies:
-                            copies[material] = scene.with_own_textures(material, recolor, Path(folder), prefix)
+                            name = material.name
+                            copy, images = scene.with_own_textures(material, recolor, Path(folder), prefix)
+                            if material.library is None:
+                                # Files name the copy as the original.
+                                material.name, copy.name = f"{name} (original)", name
+                            copies[material] = copy, images, name
                         material = copies[material][0]
                     slot.link, slot.material = "OBJECT", material
             window.scene = stage
@@ -169,8 +177,10 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
             region.view_perspective = perspective
         for obj in made:
             bpy.data.objects.remove(obj)
-        for material, images in copies.values():
-            bpy.data.materials.remove(material)
+        for material, (copy, images, name) in copies.items():
+            bpy.data.materials.remove(copy)
+            if material.library is None:
+                material.name = name
             for image in images:
                 bpy.data.images.remove(image)
         bpy.data.scenes.remove(stage)
