@@ -49,9 +49,9 @@ class Files:
         self.folder = folder
         self.paths: list[str] = []
         for parent, folders, names in os.walk(folder, followlinks=True):
-            inside = sorted(name for name in folders if name not in without or parent != str(folder))
-            folders[:] = [name for name in inside if not _leads_back(Path(parent) / name)]
             within = Path(parent).relative_to(folder)
+            inside = sorted(name for name in folders if name not in without or parent != str(folder))
+            folders[:] = [name for name in inside if not _leads_back(folder, within / name)]
             self.paths += [(within / name).as_posix() for name in sorted(names) if not name.startswith(".")]
         self._levels: list[dict[str, list[str]]] = []
         for level in range(4):
@@ -75,9 +75,10 @@ class Files:
         return next((path for name in names if (path := self.find(name)) is not None), None)
 
 
-def _leads_back(folder: Path) -> bool:
-    """Return whether a folder is a link to one that it is in."""
-    return folder.is_symlink() and folder.parent.resolve().is_relative_to(folder.resolve())
+def _leads_back(folder: Path, path: Path) -> bool:
+    """Return whether a path below a folder is, by links, one of the folders that it goes through, or contains one."""
+    place = (folder / path).resolve()
+    return any((folder / parent).resolve().is_relative_to(place) for parent in path.parents)
 
 
 def _folded(name: str, level: int) -> str:

@@ -7,6 +7,7 @@ import errno
 import functools
 import io
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -35,9 +36,7 @@ _OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG
 _UNALLOCATED = ("allocate memory", "DefaultCPUAllocator: not enough memory")
 _LONGEST = 1000
 """Number of characters of an error message; names and paths in it may be longer."""
-_AGAIN, _RESTART = "the same command again", "--restart"
-"""Words of the message of a stop, and the option that would discard what it says is kept, once the command has begun
-anew and cleared it."""
+_RESTART = "--restart"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -116,26 +115,33 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
         _tell(functools.partial(reporter.error, **fields), _shortened(str(error)))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:
-        stopped = str(error) or "Stopped immediately."
-        if _RESTART in arguments and options is not None and not options.restart:
-            stopped = stopped.replace(_AGAIN, f"{_AGAIN} without {_RESTART}")
-        _tell(reporter.stopped, stopped)
+        _tell(reporter.stopped, _without_restart(str(error) or "Stopped immediately.", arguments, options))
         return EXIT_CANCELLED
     except ProcessLost as error:
-        _tell(reporter.error, str(error))
+        _tell(reporter.error, _without_restart(str(error), arguments, options))
         return EXIT_FAILED
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT_ERRORS:
             raise  # Files are written with their names in the error, so this is a stream.
         sentence = _describe_error(error)
         if sentence:
-            _tell(reporter.error, _shortened(sentence))
+            _tell(reporter.error, _without_restart(_shortened(sentence), arguments, options))
             return EXIT_BAD_INPUT
         import traceback
 
         traceback.print_exc(file=sys.stderr)
         _tell(reporter.error, _shortened(f"Unexpected error: {type(error).__name__}: {error}"))
         return EXIT_FAILED
+
+
+def _without_restart(sentence: str, arguments: list[str], options: argparse.Namespace | None) -> str:
+    """Return a message about what the same command continues, for a command that would discard it by its --restart.
+
+    Commands clear this option once they have begun anew.
+    """
+    if _RESTART not in arguments or options is None or options.restart:
+        return sentence
+    return re.sub("(same command( again)?)", rf"\1 without {_RESTART}", sentence)
 
 
 def _reporter(as_json: bool) -> Reporter:

@@ -10,6 +10,7 @@ import torch
 
 from ..raster import devices, object_map, rasterize
 from ..raster.camera import Camera
+from ..raster.gpu.binning import forget_capacity
 from .object_model import ObjectModel, anchors_in_view
 
 
@@ -52,6 +53,7 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     except Exception as error:
         if camera.height < 2 * _LEAST_HEIGHT or not devices.is_out_of_memory(error):
             raise
+    forget_capacity(model.device)
     if model.device.type == "cuda":
         torch.cuda.empty_cache()
     half = camera.height // 2

@@ -152,7 +152,7 @@ def explain_cuda_error(error: str, toolkit: str | None) -> str:
         )
     if "no nvidia driver" in text:
         return _NO_DRIVER
-    if "no cuda gpus" in text or "no cuda-capable device" in text:
+    if "no cuda gpus" in text or "no hip gpus" in text or "no cuda-capable device" in text:
         return _NO_GPU
     first = error.strip().partition("\n")[0].rstrip(".") or "no reason was given"
     return f"CUDA does not start on this computer ({first}); restarting it, or a newer NVIDIA driver, may help."

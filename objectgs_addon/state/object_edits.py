@@ -299,7 +299,7 @@ def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]])
         messages.show(f"Colors were not changed: {messages.sentence(error)}", "ERROR")
         return
     for item, _ in items:
-        _remember(item)
+        _remember(item, colors_only=True)
     if any("color" in names for _, names in items):
         _show_written(root)
 
@@ -408,9 +408,10 @@ def _require_object_mode(root: bpy.types.Collection) -> None:
     scene.require_object_mode(part for part in root.all_objects if scene.kind_of(part) is not None)
 
 
-def _remember(item: Any) -> None:
-    """Store the state that a failed edit reverts to."""
-    stored = json.dumps([item.name, list(item.color), item.chosen, object_list.recolor_of(item).stored()])
+def _remember(item: Any, colors_only: bool = False) -> None:
+    """Store the state that a failed edit reverts to, with `colors_only` but for the name and the check box."""
+    name, _, chosen, *_ = json.loads(item.stored) if colors_only and item.stored else (item.name, None, item.chosen)
+    stored = json.dumps([name, list(item.color), chosen, object_list.recolor_of(item).stored()])
     if item.stored != stored:
         item.stored = stored
 

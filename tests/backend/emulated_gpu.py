@@ -109,6 +109,20 @@ def test_insufficient_intersection_capacity_is_increased(primitive, monkeypatch)
     assert 12 < needed < 10_000 and made == [int(10_000 * 1.125), int(10 * 1.125), needed]
 
 
+def test_too_many_intersections_do_not_fit(monkeypatch):
+    """Nor do they make images that fit later fail."""
+    scene = as_float32(random_scene(0, count=12))
+    monkeypatch.setattr(binning, "_largest_totals", {})
+    few = draw(scene, camera())
+    monkeypatch.setattr("backend.raster.gpu.renderer._MOST_INTERSECTIONS", 11)
+    monkeypatch.setattr(binning, "_largest_totals", {})
+    for _ in range(2):
+        with pytest.raises(torch.cuda.OutOfMemoryError):
+            draw(scene, camera())
+    monkeypatch.setattr("backend.raster.gpu.renderer._MOST_INTERSECTIONS", 10**6)
+    assert_same_bits(few, draw(scene, camera()))
+
+
 def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkeypatch):
     monkeypatch.setattr(binning, "_largest_totals", {})
 

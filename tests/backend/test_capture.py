@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import threading
 import unicodedata
@@ -16,7 +17,7 @@ from PIL import Image, ImageCms
 from backend.capture import check_capture, load_capture
 from backend.capture.capture import HOLDOUT_EVERY
 from backend.capture.colmap import CAMERA_MODELS, Camera, read_model
-from backend.capture.files import image_size, mask_names, read_image, read_mask
+from backend.capture.files import Files, image_size, mask_names, read_image, read_mask
 from backend.capture.undistort import distort, pinhole_for, source_pixels, to_pycolmap
 from backend.commands.folder import digest
 from backend.shared.errors import InputError
@@ -1112,3 +1113,19 @@ def test_masks_have_one_of_the_usual_names(form, folder):
     assert folder + form.format("photo.1") in accepted
     assert folder + "photo.1_mask.jpg" in lossy and not set(accepted) & set(lossy)
     assert accepted[0] == f"{folder}photo.1.jpg.png", "the exact name comes first"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
+def test_linked_folders_are_listed_unless_they_lead_back(tmp_path):
+    images, elsewhere = tmp_path / "images", tmp_path / "disk" / "cam0"
+    for folder in (images / "a", images / "b", elsewhere):
+        folder.mkdir(parents=True)
+        (folder / "1.png").touch()
+    (images / "cam0").symlink_to(elsewhere)
+    (images / "best").symlink_to(images / "a")
+    for link, target in (("a/b", "b"), ("b/a", "a"), ("a/up", "."), ("b/top", "..")):
+        (images / link).symlink_to(images / target)
+    (elsewhere / "back").symlink_to(images)
+    files = Files(images)
+    assert {"a/1.png", "b/1.png", "best/1.png", "cam0/1.png", "a/b/1.png"} <= set(files.paths)
+    assert max(path.count("/") for path in files.paths) <= 3 and files.find("cam0/1.png") == images / "cam0" / "1.png"

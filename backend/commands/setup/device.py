@@ -51,7 +51,7 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
     device = devices.pick(requested)
     if device.type == "cpu":
         if requested == "auto" and (reason := devices.refused_gpu()):
-            reporter.warning(f"{reason} Until then, the CPU is used.")
+            reporter.warning(f"{reason} The CPU is used.")
         return device
     problem = None if again else _known_problem(device)
     if problem is None:

@@ -120,6 +120,11 @@ class IntersectionCount:
         return total
 
 
+def forget_capacity(device: torch.device) -> None:
+    """Forget the numbers of intersections of images, after the memory of the device was not enough for one."""
+    _largest_totals.pop(device, None)
+
+
 def tile_intersections(order: Order, outlines: torch.Tensor, width: int, height: int, capacity: int) -> Intersections:
     """Return the first `capacity` intersections, in the order of splats from near to far, sorted by tile."""
     device = outlines.device

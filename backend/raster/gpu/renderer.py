@@ -98,7 +98,7 @@ def forward(
         "blend", FLAT=flat, LABELS=labels is not None, DEPTHS=want_depth, MEDIAN=want_median, NORMALS=want_normals,
         MOMENTS=want_moments,
     )  # fmt: skip
-    capacity = total.expected_capacity()
+    capacity = min(total.expected_capacity(), _MOST_INTERSECTIONS)
     while True:
         intersections = tile_intersections(order, outlines, width, height, capacity)
         blend(

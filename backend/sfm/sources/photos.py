@@ -126,7 +126,8 @@ def take_photos(
         given = [path.absolute() for path in sources]
         found = _without_doubles(given)
         if sum(path.suffix.lower() in PHOTOS for path in found) < 2:
-            found = _in_order(given)  # A single photo beside a video of its name is no Live Photo.
+            # A single photo beside a video of its name is no Live Photo.
+            found = _in_order([*found, *(path for path in given if path.suffix.lower() in VIDEOS)])
         try:
             base = Path(os.path.commonpath([path.parent for path in found]))
         except ValueError as error:

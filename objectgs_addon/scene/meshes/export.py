@@ -70,18 +70,21 @@ def export(
         files = {out / f"{stem}.{suffix}": [object_id] for object_id, stem in stems.items()}
     for path in files:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
-    if in_capture:
-        parts_of_all = (part for object_id in chosen for part in scene.parts_of(collections[object_id]))
-        _require_near(root, [part for part in parts_of_all if scene.kind_of(part) == "mesh"])
-    for path, those in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        parts = [
+    parts_of = {
+        path: [
             (collection, mesh)
             for object_id in those
             for collection in (collections[object_id], *copies.get(object_id, ()))
             for mesh in scene.parts_of(collection)
             if scene.kind_of(mesh) == "mesh"
         ]
+        for path, those in files.items()
+    }
+    if in_capture:
+        for parts in parts_of.values():
+            _require_near(root, [mesh for _, mesh in parts])
+    for path, parts in parts_of.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
         # Other formats than GLB have textures beside them, where those of another file must not be replaced.
         prefix = "" if suffix == "glb" else f"{bpy.path.clean_name(path.stem)}_"
         with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, prefix):
