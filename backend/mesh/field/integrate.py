@@ -166,19 +166,47 @@ def _slopes(object_depth, fx, fy, cx, cy, jump, slope, weight):
 
 def may_add(camera: Camera, origin: np.ndarray, voxel: float, coords: np.ndarray) -> bool:
     """Return whether a view may show any of the blocks, so that `add` may change them; arguments as for `add`."""
-    viewmat, (fx, fy, cx, cy) = camera.arrays()
+    viewmat, intrinsics = camera.arrays()
+    return _shows_any(
+        viewmat, intrinsics, float(camera.near), camera.width, camera.height, np.asarray(origin, np.float64),
+        float(voxel), coords,
+    )  # fmt: skip
+
+
+@kernel()
+def _shows_any(viewmat, intrinsics, near, width, height, origin, voxel, coords):
+    center = np.empty(3)
+    for b in range(coords.shape[0]):
+        radius = _sphere_around(origin, voxel, coords, b, center)
+        if _shows(viewmat, intrinsics, near, width, height, center, radius):
+            return True
+    return False
+
+
+@kernel()
+def _sphere_around(origin, voxel, coords, b, center):
+    """Write the center of block b; returns the radius of the sphere around its samples."""
     half = 0.5 * (SIDE - 1) * voxel
-    radius = half * np.sqrt(3.0)
-    centers = origin + coords * (SIDE * voxel) + half
-    x, y, z = viewmat[:3, :3] @ centers.T + viewmat[:3, 3:]
-    ahead = z + radius > camera.near
-    far = z > 2 * radius
-    with np.errstate(all="ignore"):
-        u, v = fx * x / z + cx, fy * y / z + cy
-        spread = 2 * radius / z * (1 + np.maximum(np.abs(x), np.abs(y)) / z)
-        beside = (u + fx * spread < 0) | (u - fx * spread > camera.width)
-        beside |= (v + fy * spread < 0) | (v - fy * spread > camera.height)
-    return bool((ahead & ~(far & beside)).any())
+    for i in range(3):
+        center[i] = origin[i] + coords[b, i] * SIDE * voxel + half
+    return half * np.sqrt(3.0)
+
+
+@kernel()
+def _shows(viewmat, intrinsics, near, width, height, center, radius):
+    """Return whether a view may show a part of a sphere."""
+    fx, fy, cx, cy = intrinsics
+    z = viewmat[2, 0] * center[0] + viewmat[2, 1] * center[1] + viewmat[2, 2] * center[2] + viewmat[2, 3]
+    if z + radius <= near:
+        return False
+    if z <= 2 * radius:
+        return True
+    x = viewmat[0, 0] * center[0] + viewmat[0, 1] * center[1] + viewmat[0, 2] * center[2] + viewmat[0, 3]
+    y = viewmat[1, 0] * center[0] + viewmat[1, 1] * center[1] + viewmat[1, 2] * center[2] + viewmat[1, 3]
+    u, v = fx * x / z + cx, fy * y / z + cy
+    # Upper limit of the projected radius.
+    spread = 2 * radius / z * (1 + max(abs(x), abs(y)) / z)
+    return not (u + fx * spread < 0 or u - fx * spread > width or v + fy * spread < 0 or v - fy * spread > height)
 
 
 def add(
@@ -215,25 +243,14 @@ def _add(
     fx, fy, cx, cy = intrinsics
     height, width = surface_depth.shape
     h, w = object_depth.shape
-    half = 0.5 * (SIDE - 1) * voxel
-    radius = half * np.sqrt(3.0)
     for b in prange(coords.shape[0]):
         corner = np.empty(3)
         center = np.empty(3)
+        radius = _sphere_around(origin, voxel, coords, b, center)
+        if not _shows(viewmat, intrinsics, near, width, height, center, radius):
+            continue
         for i in range(3):
             corner[i] = origin[i] + coords[b, i] * SIDE * voxel
-            center[i] = corner[i] + half
-        z = viewmat[2, 0] * center[0] + viewmat[2, 1] * center[1] + viewmat[2, 2] * center[2] + viewmat[2, 3]
-        if z + radius <= near:
-            continue
-        if z > 2 * radius:
-            x = viewmat[0, 0] * center[0] + viewmat[0, 1] * center[1] + viewmat[0, 2] * center[2] + viewmat[0, 3]
-            y = viewmat[1, 0] * center[0] + viewmat[1, 1] * center[1] + viewmat[1, 2] * center[2] + viewmat[1, 3]
-            u, v = fx * x / z + cx, fy * y / z + cy
-            # Upper limit of the projected radius of the sphere around the block.
-            spread = 2 * radius / z * (1 + max(abs(x), abs(y)) / z)
-            if u + fx * spread < 0 or u - fx * spread > width or v + fy * spread < 0 or v - fy * spread > height:
-                continue
         for n in range(SAMPLES):
             px = corner[0] + (n // (SIDE * SIDE)) * voxel
             py = corner[1] + (n // SIDE % SIDE) * voxel
