@@ -210,7 +210,7 @@ def _rest(context: PlanningContext) -> Decision | None:
 def _labels(context: PlanningContext) -> Decision | None:
     if not context.labeled:
         return None
-    what, capture = "the loss of object IDs", context.capture
+    what, capture = "learning the object IDs of the masks", context.capture
     if context.choices.settings.semantic_weight == 0:
         return Decision("labels", what, False, "--semantic-weight 0 was given", can_override=False)
     ids = len(capture.object_ids)

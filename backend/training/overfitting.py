@@ -2,7 +2,7 @@
 
 Splats can fit a few photos exactly without fitting the scene. It shows in views that the training does not see: their
 PSNR falls, while that of its own photos rises. Some training views are therefore spared during the first part of a
-training, and join the others afterwards. If their PSNR has fallen, each further step renders a random half of the
+training, and join the others afterward. If their PSNR has fallen, each further step renders a random half of the
 splats, so that none can rely on the others (DropGaussian, Park et al. 2025). Without overfitting, this would cost
 quality, so it is not the default.
 """

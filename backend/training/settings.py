@@ -110,7 +110,7 @@ def growth_interval(step: int) -> int:
 
 
 PLATEAU_FROM, PLATEAU_UNTIL = 0.2, 0.8
-"""Range of the progress in which the learning rates are nearly constant. Most is learned there; the decay afterwards
+"""Range of the progress in which the learning rates are nearly constant. Most is learned there; the decay afterward
 refines the result."""
 _DECAY = {PLATEAU_FROM: 0.25, PLATEAU_UNTIL: 0.3}
 """Decay of the learning rates at both ends of the plateau, from 0 (none) to 1 (complete)."""

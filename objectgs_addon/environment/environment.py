@@ -37,11 +37,13 @@ class EnvironmentState:
         state: absent, incomplete, outdated, ready or broken.
         python: Python of a ready environment, else None.
         sentence: description for the user.
+        device: what a ready environment was set up for, cpu or cuda, else None.
     """
 
     state: str
     python: Path | None
     sentence: str
+    device: str | None = None
 
 
 def inspect(folder: str | Path, remedy: str = "press Set Up Backend") -> EnvironmentState:
@@ -77,7 +79,7 @@ def inspect(folder: str | Path, remedy: str = "press Set Up Backend") -> Environ
             "outdated", None, f"The compute backend was set up for another version of ObjectGS; {remedy} again."
         )
     found = f"Python {ready['python']}, PyTorch {ready['packages'].get('torch', '?')}"
-    return EnvironmentState("ready", python, f"The compute backend is ready: {found}.")
+    return EnvironmentState("ready", python, f"The compute backend is ready: {found}.", ready["device"])
 
 
 @functools.lru_cache(4)

@@ -90,6 +90,11 @@ def backend_python() -> Path | None:
     return state.python if state.state == "ready" else None
 
 
+def may_use_gpu() -> bool:
+    """Return whether the backend's environment was set up for a GPU; that of another Python is not known."""
+    return _chosen_python() is None and environment.inspect(environment_folder()).device == "cuda"
+
+
 def backend_sentence() -> str:
     """Describe the backend in a sentence: its location, or why it cannot run and what to do."""
     chosen = _chosen_python()

@@ -19,13 +19,15 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
-from ..scene.kinds import KIND, kind_of, mark
+from ..scene.kinds import KIND, RECONSTRUCTION, kind_of, mark
 from ..scene.shading.graph import Graph
 
 FILM = "film"
 """Kind of the add-on's compositor nodes and of their image."""
 
 PATTERN = "splats.{:04d}.exr"
+_FRAMES = "objectgs_frames"
+"""Property of a reconstruction's collection: the folder of the film frames that renders show instead of it."""
 NEAREST_IN = 1
 """Radius in pixels of the minimum filter on the depth of Blender's rendering; it gives antialiased edges the depth of
 the object in front."""
@@ -37,7 +39,7 @@ def set_up_compositor(
     """Set up the scene's compositor to combine film frames with Blender's rendering.
 
     The current input of the compositor's output is used as Blender's rendering. If the nodes already exist, only their
-    frames are updated. The reconstruction is hidden in renders.
+    frames are updated. The reconstruction is hidden in renders, and the one whose frames these replace is not.
 
     Args:
         scene: scene whose compositor is changed.
@@ -53,13 +55,18 @@ def set_up_compositor(
     if not frames:
         raise InputError(f"{folder} contains no film frames; render them first.")
     tree = _tree(scene)
-    if _image_node(tree) is None:
+    node = _image_node(tree)
+    if node is None:
         _join(scene, view_layer, tree, _load(folder, frames), matte)
+    elif _path(node.image).parent != folder:
+        for other in scene.collection.children_recursive:
+            if kind_of(other) == RECONSTRUCTION and other.get(_FRAMES) == str(_path(node.image).parent):
+                other.hide_render = False
     _use(tree, folder, frames)
     scene.render.use_compositing = True
     scene.render.film_transparent = True
     view_layer.use_pass_z = True
-    root.hide_render = True
+    root.hide_render, root[_FRAMES] = True, str(folder)
 
 
 def has_frames(scene: bpy.types.Scene) -> bool:

@@ -8,6 +8,7 @@ import bpy
 from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
 from ..environment import known_folders
+from ..scene.kinds import RECONSTRUCTION, kind_of
 
 SUBFRAMES = 9
 """Default number of sub-frames, odd so that one is at the middle of the exposure."""
@@ -39,9 +40,16 @@ class FilmProperties(bpy.types.PropertyGroup):
 
 
 def folder_of(scene: bpy.types.Scene, reconstruction: Path) -> Path:
-    """Return the output folder of the scene's film frames, by default `film` in the reconstruction folder."""
+    """Return the output folder of a reconstruction's film frames, by default `film` in the reconstruction folder.
+
+    In a scene with several reconstructions, each has a folder of its own in the output folder.
+    """
     chosen = scene.objectgs_film.folder
-    return Path(os.path.normpath(bpy.path.abspath(chosen))) if chosen else reconstruction / "film"
+    if not chosen:
+        return reconstruction / "film"
+    folder = Path(os.path.normpath(bpy.path.abspath(chosen)))
+    count = sum(kind_of(each) == RECONSTRUCTION for each in scene.collection.children_recursive)
+    return folder / reconstruction.name if count > 1 else folder
 
 
 def is_accepted(scene: bpy.types.Scene, reconstruction: Path) -> bool:

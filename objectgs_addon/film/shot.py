@@ -22,6 +22,7 @@ from mathutils import Matrix
 from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.objects import is_singular
 from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
+from ..scene import scene_meshes
 from ..scene.capture import origin_of
 from ..scene.kinds import MESH, OBJECT_PARENT, PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
 from ..scene.object_collection import center_of
@@ -178,6 +179,15 @@ class _SplatsInstance:
     paths: tuple
     instancer: bpy.types.Object | None = None
 
+    def can_move(self) -> bool:
+        """Return whether it may have another place in other frames than those of a shot."""
+        chain: list[bpy.types.Object] = []
+        for obj in (self.splats, self.instancer):
+            while obj is not None and kind_of(obj) != PARENT:
+                chain.append(obj)
+                obj = obj.parent
+        return any(each.animation_data or each.constraints or each.rigid_body for each in chain)
+
     def is_seen(self) -> bool:
         """Return whether Blender renders it at the current frame, ignoring the reconstruction's own collection."""
         top = self.instancer or self.pivot
@@ -200,14 +210,18 @@ class _SplatsInstance:
 
 
 def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstance]) -> None:
-    """Remove the transforms of objects that are not moved in any sample, and have no duplicates, even hidden ones."""
+    """Remove the transforms of objects that are not moved in any sample, and have no duplicates, even hidden ones.
+
+    They keep their transforms of objects.json, which are those of the current frame, so objects that can move do not.
+    """
     here = np.eye(4)[None]
     counts = Counter(instance.object_id for instance in instances)
-    moving = {
+    moving = {instance.object_id for instance in instances if counts[instance.object_id] > 1 or instance.can_move()}
+    moving |= {
         object_id
         for sample in samples
         for object_id, placed in sample.objects.items()
-        if counts[object_id] > 1 or not np.array_equal(placed.maps, here)
+        if not np.array_equal(placed.maps, here)
     }
     for sample in samples:
         for object_id in sample.objects.keys() - moving:
@@ -230,16 +244,18 @@ def _instances_of(
         return above == parent if above is not None else not members.isdisjoint(obj.users_collection)
 
     ours = [obj for obj in scene.objects if is_ours(obj)]
-    found = [instance for obj in ours if (instance := _instance_of(obj, paths)) is not None]
+    whole = tuple(scene_meshes(root))
+    found = [instance for obj in ours if (instance := _instance_of(obj, paths, whole)) is not None]
     for instancer in scene.objects:
         if instancer.instance_type == "COLLECTION" and instancer.instance_collection is not None:
             for obj in instancer.instance_collection.all_objects:
                 if is_ours(obj):
-                    found.append(_instance_of(obj, paths, instancer))
+                    found.append(_instance_of(obj, paths, whole, instancer))
     return [instance for instance in found if instance is not None]
 
 
-def _instance_of(obj: bpy.types.Object, paths: Any, instancer: Any = None) -> _SplatsInstance | None:
+def _instance_of(obj: bpy.types.Object, paths: Any, whole: tuple, instancer: Any = None) -> _SplatsInstance | None:
+    """Return a splat carrier as an instance, None if it belongs to no object; whole: the meshes of the whole scene."""
     collections = list(obj.users_collection)
     pivot = (
         obj.parent
@@ -252,6 +268,8 @@ def _instance_of(obj: bpy.types.Object, paths: Any, instancer: Any = None) -> _S
     if pivot is None or object_id is None:
         return None
     meshes = [part for part in pivot.children if kind_of(part) == MESH]
+    if object_id == 0:
+        meshes += whole
     top = instancer or obj
     of_top = [path for collection in top.users_collection for path in paths.get(collection, ())]
     return _SplatsInstance(object_id, obj, pivot, (obj, *meshes), tuple(of_top), instancer)
@@ -333,7 +351,11 @@ def _sample(
         raise InputError(
             f"{camera.name} is {kind}, but splats can be rendered through perspective cameras only; choose one."
         )
-    matrix = np.array(_world_of(camera).normalized(), np.float64)
+    matrix = np.array(_world_of(camera), np.float64)
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    matrix[:3, :3] = left @ right
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        raise InputError(f"{camera.name} is mirrored by its scale or that of a parent; remove the negative scale.")
     clip = camera.data.clip_start / transform.scale, camera.data.clip_end / transform.scale
     placed = {object_id: Placed(maps=np.array(maps)) for object_id, maps in objects.items()}
     return Sample(time, transform.viewmat(matrix), _intrinsics(scene, view_layer, camera), clip, placed)

@@ -70,6 +70,7 @@ class CapturePanel(Tab, bpy.types.Panel):
             _draw_linked(layout, context.scene)
             column = layout.column(align=True)
             column.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
+            column.operator("objectgs.import_splats", icon="POINTCLOUD_DATA")
             column.operator("objectgs.make_demo", icon="MESH_MONKEY")
         else:
             _draw_display(layout, context.scene.objectgs)
@@ -112,6 +113,7 @@ def _draw_add(layout: bpy.types.UILayout) -> None:
     layout.operator("objectgs.import_photos", icon="IMAGE_DATA")
     layout.operator("objectgs.import_capture", icon="IMPORT")
     layout.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
+    layout.operator("objectgs.import_splats", icon="POINTCLOUD_DATA")
     layout.operator("objectgs.make_demo", icon="MESH_MONKEY")
 
 

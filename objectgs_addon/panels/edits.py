@@ -42,7 +42,7 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             column = layout.column(align=True)
             for text, floaters, fill in (
                 ("Remove", False, False),
-                ("Remove with Floaters", True, False),
+                ("Remove with Leftovers", True, False),
                 ("Remove and Fill", False, True),
             ):
                 operator = column.operator("objectgs.remove_object", text=text)

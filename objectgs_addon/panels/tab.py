@@ -39,8 +39,8 @@ def draw_without_objects(layout: bpy.types.UILayout, root: bpy.types.Collection)
         text = "Objects are listed once they are marked and separated."
     else:
         text = (
-            "The capture has no masks, so it trains as one scene. Objects are marked by strokes afterwards, or by "
-            "masks of another program, which Import Masks reads."
+            "The capture has no masks, so it trains as one scene. Draw over its objects after the training, or press "
+            "Import Masks for masks of another program or of a segmentation model."
         )
     write(layout, text, "INFO")
 

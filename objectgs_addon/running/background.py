@@ -120,7 +120,7 @@ def install_transformers(owner: bpy.types.Scene, report: Callable[[set[str], str
 
     Args:
         owner, report: as for `submit`.
-        then: number of the failed job to run again afterwards; 0: none.
+        then: number of the failed job to run again afterward; 0: none.
 
     Returns:
         The return value for the operator's `execute`.
@@ -317,6 +317,8 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
 def _show_poses(job: Job) -> None:
     """Show how many photos have a pose, with a button to use another set of them, or to leave out the weak ones."""
     text = " ".join([f"{job.title}: {job.message}", *map(in_blender, job.warnings[:_SHOWN_WARNINGS])])
+    if len(job.warnings) > _SHOWN_WARNINGS:
+        text += " The folder sfm of the capture names all of them."
     weak, sets, number = (job.result.get(key) for key in ("weak", "separate_sets", "set"))
     again = {"operator": "objectgs.recompute_poses", "capture": str(job.folder)}
     if isinstance(sets, list) and len(sets) > 1 and isinstance(number, int):

@@ -30,6 +30,8 @@ _PHRASES = {
     "a smaller --max-size or --max-anchors, or --device cpu": "a smaller Image Size",
     "a smaller --max-size or --max-anchors": "a smaller Image Size",
     "close other programs or lower --memory-mb": "close other programs",
+    "--objects given keeps the IDs": "choose As Given for Objects to keep the IDs",
+    "or use `masks`": "or use Import Masks",
 }
 """Advice that has other words in Blender."""
 _ONLY_TYPED = (

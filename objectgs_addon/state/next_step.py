@@ -48,7 +48,8 @@ RESUME = Step(
     "objectgs.train",
     "Resume",
     "PLAY",
-    "The training was stopped, and goes on from there. If the splats are good enough, go on in the panels below.",
+    "The training was stopped, and goes on from there. If the splats are good enough, go on without it: with Mark "
+    "Objects in a panel below or, if there are objects, with Clean Floaters in the panel Edit.",
 )
 FIND = Step(
     "objectgs.import_capture",
@@ -70,7 +71,8 @@ MARK = Step(
     "objectgs.start_marking",
     "Mark Objects",
     "GREASEPENCIL",
-    "Without masks, a stroke over each object separates it from the scene.",
+    "Without masks: draw over each object, then press Separate Objects. Suggest Objects in a panel below tries it "
+    "without strokes.",
 )
 SEPARATE = Step(
     "objectgs.separate_marked",

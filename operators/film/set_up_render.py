@@ -6,6 +6,7 @@ import gpu
 
 from ...objectgs_addon import scene
 from ..common import need
+from ..common.reporting import reports_errors
 
 
 class SetUpRender(bpy.types.Operator):
@@ -22,6 +23,7 @@ class SetUpRender(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.shown(cls, context)
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         active = context.active_object
         chosen = active if active is not None and active.select_get() else None

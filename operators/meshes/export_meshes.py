@@ -43,7 +43,8 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         if not need.reconstruction(cls, context):
             return False
-        if scene.object_meshes(need.active_root(context)):
+        root = need.active_root(context)
+        if scene.object_meshes(root) or scene.scene_meshes(root):
             return True
         cls.poll_message_set("There are no meshes yet; extract them first")
         return False
@@ -54,7 +55,7 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
         root = need.active_root(context)
         files = mesh_export.export(root, out, self.format, ids, self.per_object, self.coordinates == "capture")
         text = f"Wrote {files[0] if len(files) == 1 else f'{len(files)} files to {out}'}."
-        without = _without_mesh(root, ids)
+        without = _without_mesh(root, ids) if scene.object_meshes(root) else []
         if without:
             text += f" Left out, since they have no mesh: {', '.join(without)}."
         self.report({"INFO"}, text)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from PIL import Image, ImageFilter
 
-from . import harness, screenshots
+from . import demo_views, harness
 from .test_workflow import IDLE, script, wait
 
 IMAGES = harness.ROOT / "docs" / "manual" / "images"
@@ -33,7 +33,7 @@ PREFERENCES = (260, 200, 980, 512)
 
 def view(blender: harness.Blender, distance: float, tilt: float = 68.0) -> None:
     """Look at the table from `distance` meters, with the table left of the sidebar."""
-    screenshots.view(blender, distance, tilt=tilt, turn=105.0)
+    demo_views.view(blender, distance, tilt=tilt, turn=105.0)
     blender.run(f"window_context()['area'].spaces.active.region_3d.view_location.y = {0.1 * distance}")
 
 
@@ -232,7 +232,7 @@ def marking(window: Window) -> None:
     (folder / "objects.json").unlink()
     before = blender.run(script("result = root.name"))
     window.do(f"bpy.data.collections[{before!r}].hide_viewport = True")
-    screenshots.open_demo(blender, folder)
+    demo_views.open_demo(blender, folder)
     window.panels("MarkingPanel")
     view(blender, 1.1)
     window.do("call(bpy.ops.objectgs.start_marking)")
@@ -362,7 +362,7 @@ def from_photos(window: Window) -> None:
         timeout=600,
     )
     wait(blender, f"{IDLE} and root is not None")
-    screenshots.show_sidebar(blender)
+    demo_views.show_sidebar(blender)
     view(blender, 3.4, tilt=60.0)
     window.save("posed")
 
@@ -377,7 +377,7 @@ def from_capture(window: Window) -> None:
         bpy.ops.objectgs.import_capture("EXEC_DEFAULT", directory={capture!r}, folder={folder!r})
     """)
     wait(blender, f"{IDLE} and root is not None")
-    screenshots.show_sidebar(blender)
+    demo_views.show_sidebar(blender)
     view(blender, 3.4, tilt=60.0)
     window.save("imported")
     window.do("call(bpy.ops.objectgs.assign_objects)")
@@ -430,10 +430,10 @@ def main() -> None:
             blender.wait_for("True", timeout=180)
             blender.install(archive, Path(sys.executable))
             blender.run(script(OPEN_CLOSED_PANELS))
-            screenshots.show_sidebar(blender)
+            demo_views.show_sidebar(blender)
             setting_up(window, sys.executable)
             help_popover(window)
-            screenshots.open_demo(blender, folder / "tabletop")
+            demo_views.open_demo(blender, folder / "tabletop")
             window.do(SHOW_SPLATS)
             for part in options.only:
                 PARTS[part](window)

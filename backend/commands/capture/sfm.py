@@ -372,6 +372,12 @@ def _have_other_cameras(before: list[dict[str, Any]], now: list[dict[str, Any]])
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:
     """Report what was found, which photos have no pose and why, and which are weak."""
     path, left_out, weak = capture / WORK / REPORT, report["left_out"], report["weak"]
+    number, sets = report["set"], report["separate_sets"]
+    if sets:
+        reporter.warning(
+            f"The photos form {len(sets)} separate sets, of {', '.join(map(str, sets))} photos; set {number} is used. "
+            f"Photos that show several sets would connect them; --set {number % len(sets) + 1} uses the next."
+        )
     for name, why in list(left_out.items())[:_WORST]:
         reporter.warning(f"{name} has no pose: {why}.")
     if len(left_out) > _WORST:
@@ -384,15 +390,9 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
         reporter.warning(f"{len(weak) - _WORST} more photos are weak; {path} lists them.")
     if weak:
         reporter.warning("If the result looks wrong, compute the poses again without the weak photos.")
-    number, sets = report["set"], report["separate_sets"]
-    if sets:
-        reporter.warning(
-            f"The photos form {len(sets)} separate sets, of {', '.join(map(str, sets))} photos; set {number} is used. "
-            f"Photos that show several sets would connect them; --set {number % len(sets) + 1} uses the next."
-        )
     reporter.done(
-        message="{registered} of {photos} photos have a pose, with {points:,} points and a mean reprojection error of "
-        "{reprojection_error:.2f} pixels.".format(**report)
+        message="{registered} of {photos} photos have a pose{doubtful}, with {points:,} points and a mean reprojection "
+        "error of {reprojection_error:.2f} pixels.".format(**report, doubtful=f", {len(weak)} weak" if weak else "")
         + (" The scene has its true size, by GPS." if report["size_by_gps"] else ""),
         capture=str(capture),
         picture=str(capture / WORK / PICTURE),

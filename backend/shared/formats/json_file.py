@@ -35,9 +35,12 @@ def plain(value: Any, where: str = "value") -> Any:
     raise ValueError(f"{where} is a {type(value).__name__}, which JSON cannot hold")
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write `value` as JSON, atomically; raise ValueError for NaN and infinity, which are not valid JSON."""
-    write_atomic(path, (json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+def write_json(path: Path, value: Any, indent: int | None = 1) -> None:
+    """Write `value` as JSON, atomically; raise ValueError for NaN and infinity, which are not valid JSON.
+
+    indent: spaces before the entries of each level; None: all in one line, for large files.
+    """
+    write_atomic(path, (json.dumps(value, indent=indent, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -58,10 +61,10 @@ def parse_json(text: str | bytes) -> Any:
     return value
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file; raise InputError that names the file if it is missing or invalid."""
+def read_json(path: Path, largest: int = LARGEST) -> Any:
+    """Read a JSON file of up to `largest` bytes; raise InputError that names the file if it is missing or invalid."""
     try:
-        return parse_json(read_regular(path, LARGEST).decode("utf-8"))
+        return parse_json(read_regular(path, largest).decode("utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; run the step that creates it first.") from error
     except (OSError, ValueError) as error:

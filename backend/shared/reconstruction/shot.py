@@ -44,6 +44,8 @@ VERSION = 1
 NAME = "shot.json"
 LARGEST_SIDE = 65536
 LARGEST_FRAME = 9_999_999
+LARGEST = 1 << 30
+"""Bytes of the largest file that is read."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +123,12 @@ def write_shot(path: Path, shot: Shot) -> None:
     write_json(path, {
         "version": VERSION, "width": shot.width, "height": shot.height, "pixel_aspect": shot.pixel_aspect,
         "depth_scale": shot.depth_scale, "only_named": shot.only_named, "objects": steady, "frames": frames,
-    })  # fmt: skip
+    }, indent=None)  # fmt: skip
 
 
 def read_shot(path: Path) -> Shot:
     """Read a shot file; raise InputError with a one-sentence message that locates the problem if it is invalid."""
-    content = read_json(path)
+    content = read_json(path, LARGEST)
     try:
         return _shot(content)
     except _Wrong as error:

@@ -12,6 +12,7 @@ from ....backend.shared.durations import clock
 from ....backend.shared.expectation import PRESET_STEPS, expectation, expectation_in_words, typical_psnr
 from ....backend.shared.reconstruction.lock import lock_holder
 from ... import scene
+from ...environment import locations
 from ...process.jobs import Job
 from ...running import background, previews
 from ...running.job_display import draw_figures, write
@@ -90,11 +91,12 @@ def _training_job(root: bpy.types.Collection) -> Job | None:
 
 def _length_of(
     state: FolderState, properties: Any
-) -> tuple[int | None, float | None, float, tuple[int, float], float | None]:
+) -> tuple[int | None, float | None, float | None, tuple[int, float], float | None]:
     """Return the arguments of `expectation` for the chosen length."""
+    pixels = None if locations.may_use_gpu() else state.pixels
     seconds = 60 * properties.minutes if properties.length == "minutes" else None
     typical = None if state.agreement is None else typical_psnr(state.agreement, state.pixels)
-    return PRESET_STEPS.get(properties.length), seconds, state.pixels, (state.steps, state.seconds), typical
+    return PRESET_STEPS.get(properties.length), seconds, pixels, (state.steps, state.seconds), typical
 
 
 def _draw_faint(layout: bpy.types.UILayout, text: str) -> None:

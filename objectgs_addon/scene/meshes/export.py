@@ -24,12 +24,16 @@ _EXPORTERS = {"glb": (bpy.ops.export_scene, "gltf"), "usdc": (bpy.ops.wm, "usd_e
 """File suffix -> the operator that exports it, which is in an add-on or a part of Blender that may be missing."""
 _COARSEST = 1e-4
 """Largest rounding of positions in mesh files, relative to the size of the meshes."""
+_SHEARED = 1e-5
+"""Difference of location, rotation and scale from a placement, relative to its scale, from which on it has shear."""
 
 
 def export(
     root: bpy.types.Collection, out: Path, suffix: str, ids: list[int] | None, per_object: bool, in_capture: bool
 ) -> list[Path]:
     """Write the meshes of objects and of their duplicates; removed objects and objects without a mesh are skipped.
+
+    If no object has a mesh, those of the whole scene or of sets of objects are written, where all are chosen.
 
     Args:
         root: the reconstruction's collection.
@@ -53,7 +57,8 @@ def export(
         for object_id in sorted(scene.object_meshes(root))
         if (ids is None or object_id in ids) and not scene.is_removed(collections[object_id])
     ]
-    if not chosen:
+    whole = scene.scene_meshes(root) if ids is None and not scene.object_meshes(root) else []
+    if not chosen and not whole:
         raise InputError(
             "No chosen object has a mesh, or all of them are removed; extract meshes, or choose other objects."
         )
@@ -64,22 +69,24 @@ def export(
         )
     if per_object and out.is_file():
         raise InputError(f"{out} is a file; choose another name for the folder.")
-    files: dict[Path, list[int]] = {out: chosen}
+    parts_by_name: dict[int, tuple[str, list[tuple[bpy.types.Collection, bpy.types.Object]]]] = {
+        object_id: (
+            collections[object_id].name,
+            [
+                (collection, mesh)
+                for collection in (collections[object_id], *copies.get(object_id, ()))
+                for mesh in scene.parts_of(collection)
+                if scene.kind_of(mesh) == "mesh"
+            ],
+        )
+        for object_id in chosen
+    } or {number: (mesh.name, [(root, mesh)]) for number, mesh in enumerate(whole)}
+    parts_of = {out: [part for _, parts in parts_by_name.values() for part in parts]}
     if per_object:
-        stems = distinct_stems({object_id: collections[object_id].name for object_id in chosen})
-        files = {out / f"{stem}.{suffix}": [object_id] for object_id, stem in stems.items()}
-    for path in files:
+        stems = distinct_stems({key: name for key, (name, _) in parts_by_name.items()})
+        parts_of = {out / f"{stem}.{suffix}": parts_by_name[key][1] for key, stem in stems.items()}
+    for path in parts_of:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
-    parts_of = {
-        path: [
-            (collection, mesh)
-            for object_id in those
-            for collection in (collections[object_id], *copies.get(object_id, ()))
-            for mesh in scene.parts_of(collection)
-            if scene.kind_of(mesh) == "mesh"
-        ]
-        for path, those in files.items()
-    }
     if in_capture:
         for parts in parts_of.values():
             _require_near(root, [mesh for _, mesh in parts])
@@ -89,7 +96,7 @@ def export(
         prefix = "" if suffix == "glb" else f"{bpy.path.clean_name(path.stem)}_"
         with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, prefix):
             _write(path, suffix, in_capture)
-    return list(files)
+    return list(parts_of)
 
 
 def _require_near(root: bpy.types.Collection, meshes: list[bpy.types.Object]) -> None:
@@ -114,6 +121,7 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
                 export_yup=not in_capture,
                 export_apply=True,
                 use_active_scene=True,
+                export_animations=False,
             )
         elif suffix == "usdc":
             bpy.ops.wm.usd_export(filepath=str(path), export_materials=True, overwrite_textures=True)
@@ -143,6 +151,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
     ]
     stage = bpy.data.scenes.new("ObjectGS export")
     made: list[bpy.types.Object] = []
+    sheared: list[bpy.types.Mesh] = []
     copies: dict[bpy.types.Material, tuple[bpy.types.Material, list[bpy.types.Image], str]] = {}
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -152,7 +161,15 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                 place = scene.matrix_to_capture(root, mesh) if in_capture else scene.matrix_to_world(mesh)
                 obj.parent = None
                 obj.constraints.clear()
+                # Exporters evaluate other frames.
+                obj.animation_data_clear()
                 obj.matrix_basis = Matrix(place.tolist())
+                if np.abs(np.array(obj.matrix_basis) - place).max() > _SHEARED * np.abs(place[:3, :3]).max():
+                    # Location, rotation and scale cannot express shear.
+                    obj.data = mesh.data.copy()
+                    sheared.append(obj.data)
+                    obj.data.transform(Matrix(place.tolist()))
+                    obj.matrix_basis = Matrix()
                 obj.hide_viewport = obj.hide_render = False
                 stage.collection.objects.link(obj)
                 recolor, ours = scene.recolor_of(collection), our_materials(mesh)
@@ -180,6 +197,8 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
             region.view_perspective = perspective
         for obj in made:
             bpy.data.objects.remove(obj)
+        for data in sheared:
+            bpy.data.meshes.remove(data)
         for material, (copy, images, name) in copies.items():
             bpy.data.materials.remove(copy)
             if material.library is None:
