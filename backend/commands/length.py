@@ -70,10 +70,10 @@ def expected_psnr_of(
 def _length(
     budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress | None
 ) -> tuple[int | None, float | None, float | None, tuple[int, float]]:
-    """Return the length of a training as the arguments of `expectation`; that until convergence is not known."""
+    """Return the length of a training as the arguments of `expectation`, the longest until convergence."""
     pixels = _pixels(capture) if device.type == "cpu" else None
     trained = (0, 0.0) if done is None else (done.step, done.seconds)
-    return budget.steps, None if budget.until_converged else budget.seconds, pixels, trained
+    return budget.steps, budget.seconds, pixels, trained
 
 
 def training_seconds(budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress) -> float:

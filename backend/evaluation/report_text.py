@@ -119,7 +119,7 @@ def _of_validation(report: Report) -> str:
     if not count:
         return ""
     views = "1 other view was" if count == 1 else f"{count} other views were"
-    return f"{views} used for validation instead of training: their PSNR decided when the training ended. "
+    return f"{views} not trained on either until the training had converged, since their PSNR decided when it had. "
 
 
 def _of_unlabeled(report: Report) -> str:

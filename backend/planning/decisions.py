@@ -310,7 +310,7 @@ def _validation_views(context: PlanningContext) -> Decision | None:
         why = "they are too few to spare any for validation, so their loss decides when the training ends"
         what = f"training on all {_views(len(training))}"
         return Decision("validation-views", what, True, why, can_override=False)
-    why = f"the training ends when their PSNR has converged: {_listed(context.names(found))}"
+    why = f"until their PSNR has converged, which ends the training: {_listed(context.names(found))}"
     return Decision("validation-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 

@@ -1,6 +1,23 @@
-"""Formatting of durations."""
+"""Measuring and formatting of durations."""
 
 from __future__ import annotations
+
+import sys
+import time
+
+
+def awake_seconds() -> float:
+    """Return a time in seconds from an unknown start that stands still while the computer sleeps.
+
+    On Linux and macOS, `time.monotonic` does; on Windows it goes on.
+    """
+    if sys.platform == "win32":
+        import ctypes
+
+        ticks = ctypes.c_ulonglong()
+        if ctypes.windll.kernel32.QueryUnbiasedInterruptTime(ctypes.byref(ticks)):
+            return ticks.value / 1e7
+    return time.monotonic()
 
 
 def clock(seconds: float) -> str:

@@ -62,7 +62,8 @@ class TrainingProgress:
         converged_at: step at which the training converged and the learning rate decay began; 0 before.
         curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality, on held-out
             views unless they are left for later, as `validation_psnr` on validation views, and as `watched_psnr` on
-            those of `watched`.
+            those of `watched`. `objective` tells apart losses that do not compare.
+        joined: whether the validation views are trained on, too, after they have decided on the end.
         watched: training views that are spared, as `overfitting` describes.
         dropped: fraction of the splats that each step leaves out.
     """
@@ -79,11 +80,20 @@ class TrainingProgress:
     curve: list[dict[str, Any]] = field(default_factory=list)
     watched: list[int] = field(default_factory=list)
     dropped: float = 0.0
+    joined: bool = False
 
     @property
     def latest(self) -> dict[str, Any]:
         """The latest entry of the curve with figures of held-out views, or an empty one."""
         return next((entry for entry in reversed(self.curve) if entry.get("psnr") is not None), {})
+
+    def join(self, validation: Sequence[int], rng: np.random.Generator) -> bool:
+        """Train on the validation views first, and on all views from then on; return whether there are such views."""
+        if self.joined or not validation:
+            return False
+        self.joined = True
+        self.queue += rng.permutation(validation).tolist()
+        return True
 
     @property
     def causes(self) -> str:
@@ -171,6 +181,9 @@ class Budget:
         if self.until_converged:
             # Stops must not delay evaluations, which decide when the training ends.
             p.evaluated = int(p.curve[-1]["step"]) if p.curve else 0
+            if p.converged_at and not has_converged(p) and not self._is_limited(p):
+                # An earlier, smaller limit has ended the plateau.
+                p.converged_at = 0
         else:
             p.evaluated = bisect_right(_EVALUATIONS, self.progress(p))
 
@@ -197,17 +210,36 @@ class Budget:
         if not self.until_converged or p.converged_at:
             return False
         p.grown = p.grown or _growth_has_ceased(p.curve)
-        converged = convergence_step(p.curve)
-        if not self._out_of_time(p) and (converged is None or p.step < max(converged, WARM_UP)):
+        if not self._out_of_time(p) and not has_converged(p):
             return False
         p.converged_at = p.step
         return True
 
     def _out_of_time(self, p: TrainingProgress) -> bool:
         """Return whether the plateau must end now so that the training ends within the time limit."""
-        if self.seconds is None or p.converged_at or not p.step:
-            return False
-        return p.seconds >= DECAY_FROM * self.seconds
+        return self._is_limited(p) and not p.converged_at and p.step > 0
+
+    def _is_limited(self, p: TrainingProgress) -> bool:
+        """Return whether the last part of the time limit has begun, in which the learning rates fall."""
+        return self.seconds is not None and p.seconds >= DECAY_FROM * self.seconds
+
+
+def objective_of(p: TrainingProgress, downscale: int) -> str:
+    """Return a name of what the loss is measured on: images reduced by a factor, of some views, of some splats."""
+    return f"1/{downscale}, {len(p.watched)} spared, {p.dropped:g} dropped{', joined' if p.joined else ''}"
+
+
+def plateau_end(p: TrainingProgress) -> str:
+    """Return a sentence without a period on why the plateau of a training until convergence has ended."""
+    why = "The training has converged" if has_converged(p) else "The time limit is near"
+    return f"{why}; its learning rates fall from step {p.converged_at:,} on"
+
+
+def has_converged(p: TrainingProgress) -> bool:
+    """Return whether the measurements so far, or those until the plateau ended, say that the training has converged."""
+    step = p.converged_at or p.step
+    converged = convergence_step([entry for entry in p.curve if entry["step"] <= step])
+    return converged is not None and step >= max(converged, WARM_UP)
 
 
 def _seconds_at(p: TrainingProgress, step: int) -> float:
@@ -264,13 +296,16 @@ def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
 def _gain_per_octave(curve: list[dict[str, Any]]) -> float | None:
     """Return the quality gain in dB per doubling of the number of steps; None if the curve is too short.
 
-    The quality is the PSNR on the validation views or, if there are none, the loss in dB. It is never the PSNR on the
-    held-out views: a training that ended where these are best would flatter the figures that are reported of them.
+    The quality is the PSNR on the validation views or, if there are none, the loss in dB, as long as it is that of the
+    same objective as now. It is never the PSNR on the held-out views: a training that ended where these are best would
+    flatter the figures that are reported of them.
     """
     last = curve[-1]["step"] if curve else 0
     recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
     validated = all(entry.get("validation_psnr") is not None for entry in recent)
     key = "validation_psnr" if validated else "loss_db"
+    if not validated:
+        recent = [entry for entry in recent if entry.get("objective") == curve[-1].get("objective")]
     found = [(math.log2(entry["step"]), entry[key]) for entry in recent if entry.get(key) is not None]
     if len(found) < 5 or found[-1][0] - found[0][0] < MIN_OCTAVES:
         return None

@@ -31,7 +31,7 @@ FEWEST, MOST = 3 * WATCHED, 60
 """Numbers of training views from which and up to which some are spared."""
 
 UNTIL, UNTIL_STEP = 0.35, 3 * WARM_UP
-"""Progress up to which they are spared; for a training until convergence, the number of steps."""
+"""Progress up to which they are spared; for a training until convergence, the number of steps, or until then."""
 
 FALL_DB = 0.2
 """The training overfits if the mean PSNR of the spared views has fallen by more than this below its maximum."""
@@ -93,7 +93,8 @@ def watch(p: TrainingProgress, budget: Budget) -> bool:
         return False
     if _has_fallen(p.curve):
         p.dropped = DROPPED
-    if p.dropped or (p.step >= UNTIL_STEP if budget.until_converged else budget.progress(p) >= UNTIL):
+    ends = p.step >= UNTIL_STEP or p.converged_at > 0 if budget.until_converged else budget.progress(p) >= UNTIL
+    if p.dropped or ends:
         p.watched = []
     return p.dropped > 0
 

@@ -208,6 +208,10 @@ class ViewStep:
         view = self.scene.capture.views[index]
         return downscale_at(progress, max(view.width, view.height), self.settings.pyramid)
 
+    def largest_downscale(self, progress: float) -> int:
+        """Return the factor by which the largest training view is downscaled at a progress of 0 .. 1."""
+        return max((self._downscale(index, progress) for index in self.scene.capture.train_indices), default=1)
+
     def measure_seconds(self, index: int) -> float:
         """Measure how long the gradients of a view take at the start of the training; nothing is changed.
 

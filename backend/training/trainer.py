@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -20,13 +19,15 @@ import torch
 from ..model.checkpoint import save_checkpoint
 from ..model.object_model import ObjectModel
 from ..raster import devices
+from ..shared.durations import awake_seconds
 from ..shared.errors import Cancelled, InputError, ProcessLost
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
 from ..shared.stopping import StopRequest
 from . import check_finite, overfitting
-from .budget import Budget, TrainingProgress
+from .budget import Budget, TrainingProgress, objective_of, plateau_end
 from .cells.region import Region
+from .exposure.photo_colors import begin_colors
 from .initial_model import DistantPoints, initial_model
 from .optimizer.model_optimizer import ModelOptimizer
 from .processes.shared_views import Outcome, SharedViews
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT_SECONDS = 30.0
 _REPORT_SECONDS = 0.5
-_CONVERGED = "The training has converged; its learning rates fall from step {steps:,} on"
 
 Evaluate = Callable[[ObjectModel, Scene, TrainingProgress], dict[str, Any]]
 
@@ -264,15 +264,17 @@ class Trainer:
         if evaluate is not None and not p.step and not capture.validation_indices:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
-        started = last_saved = last_report = time.monotonic()
+        started = last_saved = last_report = awake_seconds()
         smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:
-            p.seconds = before + time.monotonic() - started
+            p.seconds = before + awake_seconds() - started
             if evaluate is not None and budget.evaluation_is_due(p):
-                self._evaluate(evaluate, reporter, float(smooth))
+                self._evaluate(evaluate, reporter, float(smooth), budget.progress(p))
                 if budget.check_convergence(p):
-                    reporter.status(_CONVERGED.format(steps=p.step))
+                    reporter.status(plateau_end(p))
+                    if p.join(capture.validation_indices, self.rng):
+                        begin_colors(self.view_step.colors, self.shown, self.scene)
                 if overfitting.watch(p, budget):
                     reporter.status(overfitting.OVERFITS)
                 self._team.tell_state(p.__dict__)
@@ -281,10 +283,10 @@ class Trainer:
                 break
             if stop.paused:
                 self.save(checkpoints)
-                last_saved = time.monotonic()
-            wait_started = time.monotonic()
+                last_saved = awake_seconds()
+            wait_started = awake_seconds()
             stopped = stop()
-            waited = time.monotonic() - wait_started
+            waited = awake_seconds() - wait_started
             started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
             if stopped:
                 self.save(checkpoints)
@@ -297,7 +299,7 @@ class Trainer:
             if parts == 1 < self.parts:
                 reporter.warning(IN_PARTS.format(parts=self.parts))
                 parts = self.parts
-            now = time.monotonic()
+            now = awake_seconds()
             if now - last_report >= _REPORT_SECONDS:
                 last_report = now
                 p.seconds = before + now - started
@@ -305,17 +307,18 @@ class Trainer:
                 self.optimizer.check.watch()
             if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)
-                last_saved = time.monotonic()
+                last_saved = awake_seconds()
         self.save(checkpoints)
         if p.skipped:
             reporter.warning(f"{p.skipped} updates were not finite and were skipped{p.causes and f': {p.causes}'}.")
 
-    def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float) -> None:
+    def _evaluate(self, evaluate: Evaluate, reporter: Reporter, loss: float, progress: float) -> None:
         p = self.progress
         quality = evaluate(self.shown, self.scene, p)
         loss_db = round(-20 * math.log10(loss), 3) if 0 < loss < math.inf else None
         reached = {"seconds": round(p.seconds, 2), "step": p.step, "anchors": len(self.model.anchors)}
-        p.curve.append({**reached, "loss_db": loss_db, **quality})
+        objective = objective_of(p, self.view_step.largest_downscale(progress))
+        p.curve.append({**reached, "loss_db": loss_db, "objective": objective, **quality})
         if "psnr" in quality:
             reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
 
@@ -358,7 +361,9 @@ class Trainer:
         """
         p, team, optimizer = self.progress, self._team, self.optimizer
         while len(p.queue) < team.size:
-            views = [index for index in self.scene.capture.train_indices if index not in p.watched]
+            capture = self.scene.capture
+            views = [index for index in capture.train_indices if index not in p.watched]
+            views += capture.validation_indices if p.joined else ()
             p.queue = self.rng.permutation(views).tolist() + p.queue
         outcomes = self._shared.exchange(*self._compute(progress), len(self.model.anchors))
         # Remove the views only now, so that they remain the next ones if an image cannot be read.
@@ -434,7 +439,9 @@ class Trainer:
         while True:
             order, progress, closely = team.wait()
             if order == Order.STATE:
-                self.progress = TrainingProgress(**team.receive())
+                joined, self.progress = self.progress.joined, TrainingProgress(**team.receive())
+                if self.progress.joined and not joined:
+                    begin_colors(self.view_step.colors, self.shown, self.scene)
             elif order == Order.STEP:
                 self.optimizer.check.at_once = closely
                 self.step(progress)

@@ -17,6 +17,7 @@ from backend.training.budget import (
     TrainingProgress,
     choose_validation_views,
     convergence_step,
+    plateau_end,
 )
 from backend.training.settings import GROW_UNTIL, PLATEAU_FROM, PLATEAU_UNTIL, rate
 
@@ -77,6 +78,40 @@ def test_loss_is_used_without_validation_views():
     entries = [{"step": s, "psnr": 30.0, "loss_db": 10 + 2 * math.log2(s)} for s in steps]
     assert convergence_step(entries) == pytest.approx(converged_after(2.0)), "as in checkpoints of earlier versions"
     assert convergence_step([{**entry, "loss_db": None} for entry in entries]) is None
+
+
+def test_losses_of_other_objectives_do_not_count():
+    """Dropout, views that join and larger images make the loss worse, but say nothing of convergence."""
+    steps = range(WARM_UP, 4 * WARM_UP, 100)
+    before = [{"step": s, "loss_db": 10 + 2 * math.log2(s), "objective": "a"} for s in steps]
+    after = [{**entry, "loss_db": entry["loss_db"] - 3, "objective": "b"} for entry in before]
+    joined = [entry for entry in before if entry["step"] < 1200] + [entry for entry in after if entry["step"] >= 1200]
+    assert convergence_step(joined[: 1 + len([s for s in steps if s < 1200])]) is None
+    assert convergence_step(joined[:-5]) is None, "too few of the same objective"
+    longer = range(WARM_UP, 16 * WARM_UP, 100)
+    settled = [{"step": s, "loss_db": 2 * math.log2(s) - 3 * (s >= 1200), "objective": s >= 1200} for s in longer]
+    assert convergence_step(settled) == pytest.approx(converged_after(2.0))
+
+
+def test_greater_time_limit_continues_the_plateau():
+    limited, longer = (Budget(seconds=seconds, until_converged=True) for seconds in (50.0, 500.0))
+    p = walk(limited, lambda step: 5 * math.log2(step + 1))
+    assert p.converged_at and limited.progress(p) == 1 and plateau_end(p).startswith("The time limit is near")
+    limited.begin(p)
+    assert p.converged_at, "the same limit"
+    longer.begin(p)
+    assert not p.converged_at and longer.progress(p) < PLATEAU_UNTIL
+    done = walk(PRESETS["final"], lambda step: 30.0)
+    assert plateau_end(done).startswith("The training has converged")
+    PRESETS["final"].begin(done)
+    assert done.converged_at
+
+
+def test_validation_views_join_once():
+    p, rng = TrainingProgress(queue=[1, 2]), np.random.default_rng(0)
+    assert not p.join((), rng) and not p.joined
+    assert p.join((7, 8, 9), rng) and p.queue[:2] == [1, 2] and sorted(p.queue[2:]) == [7, 8, 9]
+    assert not p.join((7, 8, 9), rng) and len(p.queue) == 5
 
 
 def test_stops_do_not_delay_the_end_of_a_training_until_convergence():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from backend.training.optimizer.adam import BETA1, BETA2, EPSILON
+from backend.training.optimizer.adam import BETA1, BETA2, EPSILON, LARGEST_GRADIENT
 from backend.training.optimizer.head_adam import HeadAdam
 
 ROOT = Path(__file__).parents[2]
@@ -57,9 +57,9 @@ def test_steps_are_those_of_torch(skipping):
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("infinite", [False, True])
-def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(emulate_gpu, infinite):
-    """A step with a gradient or a loss that is not finite changes nothing."""
+@pytest.mark.parametrize("unusable", [None, torch.inf, 2 * LARGEST_GRADIENT])
+def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(emulate_gpu, unusable):
+    """A step with a gradient that is not finite, or whose square is not, changes nothing."""
     found = []
     for on_gpu in (False, True):
         emulate_gpu(on_gpu)
@@ -67,10 +67,10 @@ def test_steps_of_an_emulated_gpu_are_those_of_the_cpu(emulate_gpu, infinite):
         optimizer = HeadAdam(groups)
         stepped(optimizer, groups, range(5), (1,))
         set_gradients(groups, 6)
-        if infinite:
-            groups["color"][0].grad[1, 1] = torch.inf
+        if unusable is not None:
+            groups["color"][0].grad[1, 1] = unusable
         updated = optimizer.step(rates(6), torch.tensor(True))
-        assert bool(updated) != infinite
+        assert bool(updated) == (unusable is None)
         found.append(
             {**optimizer.tensors(), **{f"{n}{i}": p.detach() for n, g in groups.items() for i, p in enumerate(g)}}
         )

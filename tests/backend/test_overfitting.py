@@ -56,6 +56,12 @@ def test_spared_views_join_the_others(budget: Budget, released: int) -> None:
     assert p.watched == [] and dropout_at(p, 0.5, 7) is None
 
 
+def test_spared_views_join_where_a_training_ends_early() -> None:
+    p = TrainingProgress(step=700, watched=[3, 5], converged_at=700)
+    watch(p, Budget(until_converged=True, seconds=60.0))
+    assert p.watched == []
+
+
 def test_dropout_leaves_out_its_share_of_the_splats() -> None:
     before = splats(10_000)
     after = Dropout(0.3, 7)(before)

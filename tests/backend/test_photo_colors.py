@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from backend.raster import devices
-from backend.training.exposure.photo_colors import PhotoColors, corrected
+from backend.training.exposure.photo_colors import PhotoColors, corrected, fit_correction
 
 
 def test_correction_applies_to_render_and_background() -> None:
@@ -55,3 +55,14 @@ def test_corrections_are_restored_from_checkpoints_of_the_same_photos(photos: in
     other.restore({name: tensor.numpy() for name, tensor in colors.tensors().items()})
     assert other.values.any() == (photos == 2)
     other.restore({})
+
+
+def test_correction_is_fitted_to_a_photo() -> None:
+    rng = np.random.default_rng(0)
+    render = rng.uniform(0.1, 0.9, (8, 9, 3))
+    gain, offset = np.array([0.5, 1.0, 1.7]), np.array([0.1, 0.0, -0.05])
+    found = fit_correction(render, gain * render + offset)
+    np.testing.assert_allclose(found, [np.log(gain), offset], atol=1e-6)
+    gray = fit_correction(np.full((8, 9, 3), 0.5), render)
+    assert not gray[0].any(), "a render of one color says nothing about the gain"
+    np.testing.assert_allclose(gray[1], render.mean((0, 1)) - 0.5, atol=1e-6)

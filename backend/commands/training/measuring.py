@@ -45,7 +45,8 @@ class Measuring:
         figures = self._held_out(model, scene, allowed)
         self._spent += time.monotonic() - started
         capture = scene.capture
-        for name, indices in (("validation_psnr", capture.validation_indices), ("watched_psnr", progress.watched)):
+        validation = () if progress.joined else capture.validation_indices
+        for name, indices in (("validation_psnr", validation), ("watched_psnr", progress.watched)):
             if indices:
                 # Their exposure is not known, since they are not trained on.
                 found = []

@@ -11,16 +11,26 @@ Held-out views and new cameras have no correction.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from ...model.draw import draw
 from ..optimizer.adam import BETA1, BETA2
 from ..settings import rate
 
+if TYPE_CHECKING:
+    from ...model.object_model import ObjectModel
+    from ..scene import Scene
+
 RATES = (5e-3, 5e-4)
 """Learning rate of the corrections at the start and the end of the training."""
+
+_MOST = math.log(4)
+"""Largest log gain that is fitted at once."""
 
 PULL = 0.01
 """Weight of the square of the corrections, relative to the loss of the image."""
@@ -91,6 +101,42 @@ class PhotoColors:
             stored, found = getattr(self, name), tensors.get(_PREFIX + name)
             if found is not None and found.shape == tuple(stored.shape):
                 stored.copy_(torch.from_numpy(found.copy()))
+
+
+def begin_colors(colors: PhotoColors | None, model: ObjectModel, scene: Scene) -> None:
+    """Fit the corrections of the validation views to renders, where they join a training that is nearly done.
+
+    Args:
+        colors: the corrections, changed in place; None: photos have none.
+        model: the model as trained so far.
+        scene: the scene with the photos.
+
+    Raises:
+        InputError: a photo cannot be read.
+    """
+    if colors is None:
+        return
+    for index in scene.capture.validation_indices:
+        render = draw(model, scene.camera(index), want_ids=False).image
+        found = fit_correction(render, scene.capture.image(index) / 255)
+        colors.values[index] = torch.from_numpy(found).to(colors.values)
+
+
+def fit_correction(render: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Fit log gain and offset of each channel to a photo, with the least squared error over all pixels.
+
+    Args:
+        render, photo: (H, W, 3), 0 .. 1.
+
+    Returns:
+        (2, 3) float32; the log gain is limited, and 0 where the render has one color.
+    """
+    colors, wanted = render.reshape(-1, 3).astype(np.float64), photo.reshape(-1, 3).astype(np.float64)
+    mean, wanted_mean = colors.mean(0), wanted.mean(0)
+    spread = ((colors - mean) ** 2).mean(0)
+    gain = ((colors - mean) * (wanted - wanted_mean)).mean(0) / np.maximum(spread, 1e-12)
+    gain = np.where(spread > 1e-6, np.clip(gain, math.exp(-_MOST), math.exp(_MOST)), 1.0)
+    return np.stack([np.log(gain), wanted_mean - gain * mean]).astype(np.float32)
 
 
 def corrected(

@@ -14,7 +14,7 @@ from torch.optim.adam import adam
 
 from ...gpu.kernel import kernel
 from ...raster import devices
-from .adam import BETA1, BETA2, EPSILON, direction
+from .adam import BETA1, BETA2, EPSILON, LARGEST_GRADIENT, direction
 
 MOMENTS, STEP = ("exp_avg", "exp_avg_sq"), "step"
 """Names of the state of a parameter: tensors of its shape, and the number of steps."""
@@ -86,7 +86,7 @@ class HeadAdam:
 
     @torch.no_grad()
     def step(self, rates: Mapping[str, float], finite: torch.Tensor | None = None) -> torch.Tensor:
-        """Update the parameters that have gradients, in place, if all gradients are finite.
+        """Update the parameters that have gradients, in place, if all gradients are smaller than LARGEST_GRADIENT.
 
         Args:
             rates: The learning rate of each group.
@@ -102,7 +102,7 @@ class HeadAdam:
         if devices.on_gpu(self._parameters[0]):
             return self._step_on_gpu([(i, rates[name]) for name, numbers in stepped.items() for i in numbers], finite)
         every = [gradient.flatten() for parameter in self._parameters if (gradient := parameter.grad) is not None]
-        usable = torch.cat(every).isfinite().all()
+        usable = (torch.cat(every).abs() < LARGEST_GRADIENT).all()
         if finite is not None:
             usable = usable & finite
         for name, numbers in stepped.items():
@@ -141,7 +141,7 @@ class HeadAdam:
             row[-1:].view(np.float32)[0] = rate
         rows = devices.upload(table, device)
         usable = torch.empty((), dtype=torch.bool, device=device)
-        kernel("check_tensors")(1, _CHECKED_BY, rows, len(stepped), finite, usable)
+        kernel("check_tensors", LARGEST_GRADIENT=LARGEST_GRADIENT)(1, _CHECKED_BY, rows, len(stepped), finite, usable)
         kernel("step_tensors", BLOCKS_PER_TENSOR=_BLOCKS, BETA1=BETA1, BETA2=BETA2, EPSILON=EPSILON)(
             len(stepped) * _BLOCKS, _THREADS, rows, usable
         )
