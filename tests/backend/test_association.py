@@ -213,6 +213,29 @@ def test_objects_keep_their_ids_when_masks_are_made_anew(write_capture, tmp_path
     assert {third[object_id] for object_id, number in first.items() if number == 2} == {2}
 
 
+@pytest.mark.parametrize("how", ["find", "given"])
+def test_new_objects_get_none_of_the_ids_of_strokes(write_capture, tmp_path, run_command, how):
+    """Masks of strokes have no masks.json."""
+    scene = write_capture(views=12, points=200)
+    folder, masks = scene.folder, scene.folder / "masks"
+    (folder / "labels.json").write_text('{"1": "ball", "7": "gone"}')
+    (masks / "strokes.json").write_text("{}")
+    other = int(max(np.unique(scene.ids[0])))
+    given = tmp_path / "given"
+    for name, ids in zip(scene.names, scene.ids, strict=True):
+        stem = name.rpartition(".")[0]
+        for path in masks.glob(f"{stem}.*"):
+            path.unlink()
+        Image.fromarray((ids == 1).astype(np.uint8)).save(masks / f"{stem}.png")
+        for label, object_id in (("ball", 1), ("new", other)):
+            (given / label).mkdir(parents=True, exist_ok=True)
+            Image.fromarray(255 * (ids == object_id).astype(np.uint8)).save(given / label / f"{stem}.png")
+    done = run_command("masks", folder, given, "--objects", how)
+    assert done.code == EXIT_DONE, done.err
+    assert json.loads((folder / "labels.json").read_text()) == {"1": "ball", "8": "new"}
+    assert json.loads((masks / "masks.json").read_text())["largest_id"] == 8
+
+
 def test_regions_get_the_id_that_most_of_their_objects_regions_have(write_capture, tmp_path):
     """IDs are exchanged in seven of eighteen photos; a region without points keeps its ID."""
     scene = write_capture(views=18, size=(96, 72))

@@ -297,8 +297,8 @@ def test_separated_objects_are_listed_and_kept_by_votes(folder):
     write_objects(folder.objects, [{"id": 1, "name": "mug", "color": [1, 2, 3], "points": 9}])
     assert [(entry.id, entry.separated) for entry in read_objects(folder.objects)] == [(1, False), (5, True)]
     write_objects(folder.objects, [{"id": 5, "name": "dog", "color": [1, 2, 3], "points": 9}])
-    assert [(entry.id, entry.separated) for entry in read_objects(folder.objects)] == [(5, False)]
-    edit_objects(folder.objects, {5: dict.fromkeys(("separated", "name", "color"))})
+    dog = read_objects(folder.objects)
+    assert [(entry.id, entry.name, entry.color, entry.separated) for entry in dog] == [(5, "dog", (1, 2, 3), False)]
     assert json.loads(folder.objects.read_text())["edits"] == {}
 
 

@@ -9,6 +9,7 @@ import argparse
 import zlib
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from ...capture.files import Files, image_size, mask_names, read_image, read_mas
 from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, require_place_for_given, write_mask
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
+from ...capture.names import read_names
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
@@ -259,15 +261,28 @@ def _former(capture: Path, photos: Sequence[str]) -> _Former:
         record = read_json(folder / RECORD)
         ids = {str(entry["name"]): int(entry["id"]) for entry in record["objects"]}
         return _Former(files, ids, int(record["largest_id"]))
-    except (InputError, KeyError, TypeError, ValueError):  # A run of an older version, or strokes.
-        return _Former(files, {}, 0)
+    except (InputError, KeyError, TypeError, ValueError):
+        # Of strokes, of an older version, or with IDs that a cleanup has found anew.
+        return _undescribed(capture, files)
+
+
+def _undescribed(capture: Path, files: dict[str, Path]) -> _Former:
+    """Return former masks without masks.json; files of them that are damaged are replaced now, so they do not count."""
+    names: dict[int, str] = {}
+    with suppress(InputError):
+        names = read_names(capture)
+    largest = max(names, default=0)
+    for path in files.values():
+        with suppress(InputError):
+            largest = max(largest, int(read_mask(path).max(initial=0)))
+    return _Former(files, {name: object_id for object_id, name in names.items()}, largest)
 
 
 def _with_former_ids(
     association: Association, segments: dict[str, _Packed], seen: dict[str, Seen], former: _Former
 ) -> Association:
     """Return the objects with the IDs that they have in the former masks."""
-    ids, largest = {}, former.largest_id
+    ids = {}
     for index, (name, photo) in enumerate(seen.items()):
         if name not in former.files:
             continue
@@ -279,8 +294,7 @@ def _with_former_ids(
             at * own // whole for at, own, whole in zip(photo.xy.T[::-1], mask.shape, segments[name].shape)
         )
         ids[index] = mask[rows, columns]
-        largest = max(largest, int(mask.max(initial=0)))
-    return keep_ids(association, list(seen.values()), ids, largest + 1)
+    return keep_ids(association, list(seen.values()), ids, former.largest_id + 1)
 
 
 def _warn_of_missing(

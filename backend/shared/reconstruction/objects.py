@@ -7,7 +7,7 @@
                "6": {"cleaned": true}, "7": {"separated": true, "name": "handle", "color": [0, 99, 0]}, ...}}
 
 A new vote replaces "objects" and keeps "edits". An object with "separated" is in "edits" alone: the user has made it of
-single splats of other objects.
+single splats of other objects. If a vote finds an object of its ID, it is another one, and gets none of its edits.
 """
 
 from __future__ import annotations
@@ -101,10 +101,12 @@ def read_objects(path: Path) -> list[SceneObject]:
 
 
 def write_objects(path: Path, objects: Sequence[Mapping[str, Any]]) -> None:
-    """Replace the objects ({"id", "name", "color", "points"} each) and keep existing edits."""
+    """Replace the objects ({"id", "name", "color", "points"} each) and keep existing edits of them."""
     with _locked(path):
         edits = _edits(read_json(path), path) if path.exists() else {}
-        write_json(path, {"objects": list(objects), "edits": edits})
+        voted = {str(entry["id"]) for entry in objects}
+        kept = {key: edit for key, edit in edits.items() if not (key in voted and edit.get("separated"))}
+        write_json(path, {"objects": list(objects), "edits": kept})
 
 
 def forget_vanished(path: Path) -> None:
