@@ -23,10 +23,12 @@ class Renumbered(NamedTuple):
     Attributes:
         masks: the masks (H, W) by the index of their view, as they were if they are kept.
         agreement: how often photos give a point the ID that most of them give it, in the masks as they were.
+        others: the masks without a say, in the same form.
     """
 
     masks: dict[int, np.ndarray]
     agreement: float
+    others: dict[int, np.ndarray]
 
 
 class _Regions(NamedTuple):
@@ -36,7 +38,9 @@ class _Regions(NamedTuple):
     ids: np.ndarray
 
 
-def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent: float) -> Renumbered:
+def renumber_masks(
+    capture: Capture, masks: Mapping[int, np.ndarray], others: Mapping[int, np.ndarray], consistent: float
+) -> Renumbered:
     """Give the regions of masks the IDs of the objects that points show there.
 
     A region that shows several objects is divided, and one without points keeps its ID. Points that most photos show
@@ -45,13 +49,15 @@ def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent
     Args:
         capture: the capture.
         masks: masks (H, W) by the index of their view.
+        others: masks that have no say in what the objects are, in the same form; a region of theirs without points gets
+            no ID, since its own may be that of another object.
         consistent: agreement from which on the masks are kept as they are.
     """
     regions = {index: _regions_of(mask) for index, mask in masks.items()}
     seen = {index: _seen(capture, index, own) for index, own in regions.items()}
     agreement = consistency([regions[index].ids[own.segments] for index, own in seen.items()], list(seen.values()))
     if agreement >= consistent:
-        return Renumbered(dict(masks), agreement)
+        return Renumbered(dict(masks), agreement, dict(others))
     found = associate(list(seen.values()), len(capture.points.xyz))
     ids = _ids_of(found, list(seen.values()), list(regions.values()))
     # As one more object, whose ID is 0.
@@ -64,7 +70,15 @@ def renumber_masks(capture: Capture, masks: Mapping[int, np.ndarray], consistent
         numbers, own = regions[index]
         shown = object_mask(numbers, seen[index], _shown_most(seen[index], objects, points), points)
         anew[index] = np.where(shown > 0, ids[shown], own.astype(type_of_ids)[numbers])
-    return Renumbered(anew, agreement)
+    return Renumbered(anew, agreement, {index: ids[_shown(capture, index, others[index], points)] for index in others})
+
+
+def _shown(capture: Capture, index: int, mask: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the object (H, W) of each pixel of a mask that has no say, by the object of each point (M,)."""
+    regions = _regions_of(mask)
+    photo = _seen(capture, index, regions)
+    objects = _shown_most(photo, np.zeros(len(regions.ids), np.int64), points)
+    return object_mask(regions.numbers, photo, objects, points)
 
 
 def _regions_of(mask: np.ndarray) -> _Regions:

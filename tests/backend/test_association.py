@@ -237,15 +237,20 @@ def test_new_objects_get_none_of_the_ids_of_strokes(write_capture, tmp_path, run
 
 
 def test_regions_get_the_id_that_most_of_their_objects_regions_have(write_capture, tmp_path):
-    """IDs are exchanged in seven of eighteen photos; a region without points keeps its ID."""
+    """IDs are exchanged in seven of eighteen photos; a region without points keeps its ID, unless it has no say."""
     scene = write_capture(views=18, size=(96, 72))
     capture = load_capture(scene.folder, tmp_path / "cache")
     exchanged = np.array([0, 2, 5, 3, 4, 1])
     given = {index: exchanged[ids] if index % 5 in (1, 3) else ids for index, ids in enumerate(scene.ids)}
     given[0] = given[0].copy()
     given[0][:2, :2] = 9
-    found = renumber_masks(capture, given, 0.9)
+    others = {index: given.pop(index) for index in (6, 11)}
+    others = {index: np.where(mask > 0, mask + 10, 0) for index, mask in others.items()}
+    others[6][:2, :2] = 9
+    found = renumber_masks(capture, given, others, 0.9)
     assert found.agreement < 0.8
+    for index, mask in found.others.items():
+        assert (mask == scene.ids[index])[scene.ids[index] > 0].mean() > 0.95 and (mask[:2, :2] == 0).all()
     right = {index: (mask == scene.ids[index])[scene.ids[index] > 0].mean() for index, mask in found.masks.items()}
     assert min(right.values()) > 0.95, right
     assert (found.masks[0][:2, :2] == 9).all() and (found.masks[1][scene.ids[1] == 0] == 0).all()
@@ -254,6 +259,6 @@ def test_regions_get_the_id_that_most_of_their_objects_regions_have(write_captur
 def test_masks_that_agree_are_kept(write_capture, tmp_path):
     scene = write_capture(views=9, size=(64, 48))
     capture = load_capture(scene.folder, tmp_path / "cache")
-    found = renumber_masks(capture, dict(enumerate(scene.ids)), 0.9)
+    found = renumber_masks(capture, dict(enumerate(scene.ids)), {}, 0.9)
     assert found.agreement > 0.9
     assert all(np.array_equal(found.masks[index], ids) for index, ids in enumerate(scene.ids))

@@ -31,9 +31,12 @@ def test_regions_that_show_something_else_are_contradicted() -> None:
 
 @pytest.fixture
 def trained(write_capture, tmp_path, run_command):
-    """A capture of three spheres of which five photos have exchanged IDs and one has no mask; and its training."""
+    """A capture of three spheres of which seven photos have exchanged IDs and one has no mask; and its training.
+
+    Two of them are held out.
+    """
     scene = write_capture(views=18, size=(96, 72))
-    for view in (1, 4, 7, 11, 14):
+    for view in (0, 1, 4, 7, 8, 11, 14):
         ids = scene.ids[view]
         wrong = sum((np.where(ids == old, new, 0) for old, new in EXCHANGED.items()), np.zeros_like(ids))
         Image.fromarray(wrong.astype(np.uint16)).save(scene.folder / "masks" / f"{scene.names[view][:-4]}.png")
@@ -70,14 +73,13 @@ def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command, mo
     before = rendered(scene, out)
     given = load_capture(scene.folder, tmp_path / "given")
     masks_before = fraction_right(scene, lambda index: mask_of(given, index))
-    held_out = {index: mask_of(given, index).copy() for index in given.test_indices}
     result = run_command("clean-labels", out, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["steps"] == STEPS * 6 // 5
     again = load_capture(scene.folder, tmp_path / "again")
     masks_after = fraction_right(scene, lambda index: mask_of(again, index))
     assert masks_before < 0.96 and masks_after > 0.98
     assert rendered(scene, out) > max(before, 0.96)
-    assert all(np.array_equal(mask_of(again, index), mask) for index, mask in held_out.items())
+    assert min((mask_of(again, index) == scene.ids[index]).mean() for index in again.test_indices) > 0.95
     record = json.loads((scene.folder / "masks" / "repair.json").read_text())
     assert record["changed"][scene.names[10]] == 1.0
     # What was right is kept as it was, but for a few pixels at most.

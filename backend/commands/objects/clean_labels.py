@@ -67,11 +67,13 @@ def _clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> No
     capture = opened.capture if trained is None else _with_masks(trained, options, reporter)
     if capture is None:
         raise InputError(f"{opened.folder.folder} has no capture with masks; import the splats again with --capture.")
-    given = {
+    there = {
         index: mask.astype(np.min_scalar_type(mask.max()))
-        for index in capture.train_indices
+        for index in range(len(capture))
         if (mask := capture.uncorrected_mask(index)) is not None
     }
+    trained_on = set(capture.train_indices)
+    given = {index: mask for index, mask in there.items() if index in trained_on}
     if not any(mask.any() for mask in given.values()):
         raise InputError(f"{capture.folder} has no masks of the training's photos; import masks, or mark objects.")
     if not is_made(capture.folder / "masks"):
@@ -87,14 +89,16 @@ def _clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> No
         reporter.begin(_VOTE, f"Comparing the splats with {len(given)} masks")
         scene = None if trained is None else trained.scene
         zero_is_known = scene is not None and (scene.supervise_background or scene.zero_is_object)
-        anew = renumber_masks(capture, given, _CONSISTENT)
+        others = {index: there[index] for index in there.keys() - given.keys()}
+        anew = renumber_masks(capture, given, others, _CONSISTENT)
         if anew.agreement < _CONSISTENT:
             reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
         repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
         reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
         changed, moved = _changed(capture, given, repair), _moved(source, opened.splats, capture, repair)
         is_same = anew.agreement >= _CONSISTENT
-        _write(capture, repair.masks, {"changed": changed, "moved": moved}, is_same, reporter)
+        record = {"changed": changed, "moved": moved}
+        _write(capture, repair.masks if is_same else {**anew.others, **repair.masks}, record, is_same, reporter)
     if isinstance(source, Splats):
         reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
         write_labeled(opened.folder, source, repair.ids, capture.names, reporter)
@@ -155,7 +159,7 @@ def _write(
     keeps_ids: bool,
     reporter: StoppingReporter,
 ) -> None:
-    """Write masks of all photos with IDs, which replace the given ones; those of held-out photos are unchanged.
+    """Write masks of all photos with IDs, which replace the given ones; those that are not in `masks` are unchanged.
 
     keeps_ids: whether IDs mean the objects that they meant in the given masks.
     """
