@@ -339,6 +339,13 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
         return
     if root.objectgs.objects and job.kind != "masks":
         return
+    edits = scene.shown_edits(root)
+    if state.steps and edits is not None and edits.match:
+        messages.show(
+            "Clean Up Labels gives the splats the objects of the new masks; deleted and separated splats come back then",
+            operator="objectgs.clean_up_labels", label="Clean Up Labels",
+        )  # fmt: skip
+        return
     if state.trained:
         follow = locations.backend_job(f"Labels of {root.name}", "label", job.folder, "clean-labels", str(job.folder))
     else:

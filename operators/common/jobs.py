@@ -22,6 +22,17 @@ REGISTER, Adjust Last Operation would start the job again.
 """
 
 
+LOST_EDITS = "Deleted and separated single splats come back, since the training of borders changes all splats"
+"""What to say before a job if `loses_splat_edits`."""
+
+
+def loses_splat_edits(context: bpy.types.Context) -> bool:
+    """Return whether a training of the objects' borders makes edits of the active reconstruction's splats useless."""
+    root = need.active_root(context)
+    edits = scene.shown_edits(root)
+    return edits is not None and edits.match and folder_state(scene.folder_of(root)).steps > 0
+
+
 def submit_for_capture(
     operator: bpy.types.Operator, context: bpy.types.Context, title: str, command: str, *arguments: str
 ) -> set[str]:

@@ -7,7 +7,7 @@ from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
 from ..common import need
-from ..common.jobs import STARTS_JOB
+from ..common.jobs import LOST_EDITS, STARTS_JOB, loses_splat_edits
 
 
 class CleanUpLabels(bpy.types.Operator):
@@ -22,6 +22,13 @@ class CleanUpLabels(bpy.types.Operator):
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.masked(cls, context)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if not loses_splat_edits(context):
+            return self.execute(context)
+        return context.window_manager.invoke_confirm(
+            self, event, title="Lose Edits of Splats?", message=LOST_EDITS, confirm_text="Clean Up Labels", icon="WARNING"
+        )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         root = need.active_root(context)

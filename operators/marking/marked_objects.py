@@ -14,7 +14,7 @@ from ...objectgs_addon.environment import locations
 from ...objectgs_addon.picking import marking_tool, marks
 from ...objectgs_addon.running import background, pointing
 from ..common import need
-from ..common.jobs import STARTS_JOB
+from ..common.jobs import LOST_EDITS, STARTS_JOB, loses_splat_edits
 from ..common.reporting import reports_errors
 
 _LISTED = 3
@@ -124,14 +124,19 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         names = marks.names_without_strokes(need.active_root(context))
-        if not names:
+        lost = [LOST_EDITS] if loses_splat_edits(context) else []
+        if not names and not lost:
             return self.execute(context)
-        listed = ", ".join([*names[:_LISTED], *(["..."] if len(names) > _LISTED else [])])
+        title, sentences = "Lose Edits of Splats?", lost
+        if names:
+            title = f"{len(names)} Object{'s' if len(names) > 1 else ''} Without Strokes"
+            listed = ", ".join([*names[:_LISTED], *(["..."] if len(names) > _LISTED else [])])
+            sentences = [f"Only marked objects are kept; these become background: {listed}", *lost]
         return context.window_manager.invoke_confirm(
             self,
             event,
-            title=f"{len(names)} Object{'s' if len(names) > 1 else ''} Without Strokes",
-            message=f"Only marked objects are kept; these become background: {listed}",
+            title=title,
+            message=". ".join(sentences),
             confirm_text="Separate Marked Objects",
             icon="WARNING",
         )

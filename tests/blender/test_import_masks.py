@@ -10,6 +10,8 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.backend.shared.reconstruction.edits.splat_edits import SplatEdits
+from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background, results
@@ -108,3 +110,8 @@ def test_result_is_told_and_points_get_their_objects(root, tmp_path, monkeypatch
     imported = Job("Import", "import", Path(tmp_path / "table"), ["python"], tmp_path)
     background._assign_objects(imported, bpy.context.scene)
     assert len(asked) == 3, "an import keeps the objects"
+    blender_scene.remember_edits(root, SplatEdits().delete(np.array([5], np.uint64)), missing=0)
+    monkeypatch.setattr(background.folder_trust, "state_of", lambda _root: replace(state, steps=100))
+    monkeypatch.setattr(background.messages, "show", lambda text, **more: told.append((text, more["operator"])))
+    background._assign_objects(job, bpy.context.scene)
+    assert len(asked) == 3 and told[-1][1] == "objectgs.clean_up_labels", "deleted splats would come back"

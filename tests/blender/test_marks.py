@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 from objectgs.backend.shared.formats.ply import write_vertices
+from objectgs.backend.shared.reconstruction.edits.splat_edits import SplatEdits
 from objectgs.backend.shared.splats.picking import View
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
@@ -27,7 +28,8 @@ from objectgs.objectgs_addon.running import background, pointing
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import can_mark
-from objectgs.operators.common import need, path
+from objectgs.operators.common import jobs, need, path
+from objectgs.operators.marking import clean_labels, marked_objects
 
 import headless
 
@@ -257,6 +259,27 @@ def test_labels_of_a_training_with_masks_are_cleaned_up(root, monkeypatch):
     folder = str(blender_scene.folder_of(root))
     command = submitted[0].command
     assert command[command.index("clean-labels") + 1] == folder and submitted[0].kind == "label"
+
+
+@pytest.mark.parametrize("operator", [marked_objects.SeparateMarked, clean_labels.CleanUpLabels])
+def test_edits_of_splats_are_not_lost_without_a_question(root, monkeypatch, operator):
+    asked, steps = [], 100
+    monkeypatch.setattr(marks, "names_without_strokes", lambda _: [])
+    monkeypatch.setattr(jobs, "folder_state", lambda _: replace(UNKNOWN, steps=steps))
+    manager = SimpleNamespace(invoke_confirm=lambda *_, **options: asked.append(options) or {"RUNNING_MODAL"})
+    context = SimpleNamespace(scene=bpy.context.scene, window_manager=manager)
+
+    def invoke():
+        return operator.invoke(SimpleNamespace(execute=lambda _: {"FINISHED"}), context, None)
+
+    assert invoke() == {"FINISHED"}
+    edits = SplatEdits().delete(np.array([5, 7], np.uint64))
+    blender_scene.remember_edits(root, edits, missing=2)
+    assert invoke() == {"FINISHED"} and not asked, "those of an earlier training are lost already"
+    blender_scene.remember_edits(root, edits, missing=0)
+    assert invoke() == {"RUNNING_MODAL"} and asked[0]["message"] == jobs.LOST_EDITS
+    steps = 0
+    assert invoke() == {"FINISHED"}, "splats of another program do not change"
 
 
 class _Process:

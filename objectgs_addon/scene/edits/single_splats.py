@@ -45,6 +45,11 @@ class ShownEdits:
     missing: int = 0
     cropped: bool = False
 
+    @property
+    def match(self) -> bool:
+        """Whether any deleted or assigned splat is one of those that are shown."""
+        return self.deleted + self.assigned > self.missing
+
 
 def shown_edits(root: bpy.types.Collection) -> ShownEdits | None:
     """Return the edits of single splats that a reconstruction shows; None if it shows no splats."""
