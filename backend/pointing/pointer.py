@@ -92,8 +92,12 @@ class Pointer:
         self._latest: Solution | None = None
         self._regions: MergeTree | None = None
 
-    def solve(self, strokes: Strokes) -> np.ndarray:
+    def solve(self, strokes: Strokes, left_out: Callable[[StrokeOnNothing], object] | None = None) -> np.ndarray:
         """Find the object of each splat.
+
+        Args:
+            strokes: the strokes.
+            left_out: receives the error of a stroke that shows no splats and does without if others mark its object.
 
         Returns:
             (N,) int64 object IDs, 0 for none.
@@ -102,7 +106,19 @@ class Pointer:
             StrokeOnNothing: a stroke shows no splats.
         """
         drawn = [_Drawn(stroke, self._others(stroke, strokes.strokes)) for stroke in strokes.strokes]
-        self._shown = {each: self._contributions(n, each) for n, each in enumerate(drawn, 1)}
+        found: dict[_Drawn, _Shown] = {}
+        errors: dict[_Drawn, StrokeOnNothing] = {}
+        for number, each in enumerate(drawn, 1):
+            try:
+                found[each] = self._contributions(number, each)
+            except StrokeOnNothing as error:
+                errors[each] = error
+        self._shown = found
+        marked = {0, *(stroke.object for stroke, _ in found)}
+        for (stroke, _), error in errors.items():
+            if left_out is None or stroke.object not in marked:
+                raise error
+            left_out(error)
         areas = [shown.area for shown in self._shown.values() if shown.area]
         seeds: dict[int, np.ndarray] = {}
         for (stroke, _), shown in self._shown.items():

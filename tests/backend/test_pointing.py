@@ -247,10 +247,16 @@ def test_contributions_are_blending_weights(unlabeled) -> None:
 
 
 def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_command) -> None:
+    """A stroke that shows nothing is left out, since others mark its object."""
     scene, out = unlabeled
-    strokes = strokes_file(tmp_path, strokes_on(scene, (1, 5, 9)))
+    content = strokes_on(scene, (1, 5, 9))
+    view = load_capture(scene.folder, tmp_path / "cache").views[0]
+    away = {"viewmat": (np.diag([-1.0, 1, -1, 1]) @ view.viewmat).tolist(), "intrinsics": [90, 90, 48, 36]}
+    content["strokes"].insert(0, {"object": 1, "camera": {**away, "width": 96, "height": 72}, "points": [[0.5, 0.5]]})
+    strokes = strokes_file(tmp_path, content)
     result = run_command("label", out, "--strokes", strokes, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["objects"] == 3
+    assert [text for text in result.messages("warning") if "Stroke 1 shows no splats" in text]
     assert json.loads((scene.folder / "labels.json").read_text())["1"] == "ball"
     assert result.events[-1]["steps"] == 180, "a fifth more than before"
     capture = load_capture(scene.folder, tmp_path / "again")

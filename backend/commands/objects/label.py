@@ -81,7 +81,7 @@ def _label_trained(
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
     with stage(trained.folder, "label"):
         pointer = opened.pointer(reporter.progress, segment)
-        ids = pointer.solve(strokes)
+        ids = _solve(pointer, strokes, reporter)
         reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
         _write_masks(capture, pointer, ids, strokes, options, reporter)
     trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
@@ -101,10 +101,15 @@ def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace,
     forget_vanished(opened.folder.objects)
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
     with stage(opened.folder, "label"):
-        ids = opened.pointer(reporter.progress, segment).solve(strokes)
+        ids = _solve(opened.pointer(reporter.progress, segment), strokes, reporter)
     reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
     write_labeled(opened.folder, splats, ids, strokes.names, reporter)
     reporter.done(objects=_number_of(strokes), splats=str(opened.folder.splats))
+
+
+def _solve(pointer: Pointer, strokes: Strokes, reporter: Reporter) -> np.ndarray:
+    """Return the object (N,) of each splat; strokes that show no splats any longer are left out with a warning."""
+    return pointer.solve(strokes, lambda error: reporter.warning(f"{error} Its object is found by the other strokes."))
 
 
 def _number_of(strokes: Strokes) -> int:
