@@ -32,6 +32,8 @@ _PHRASES = {
     "close other programs or lower --memory-mb": "close other programs",
     "--objects given keeps the IDs": "choose As Given for Objects to keep the IDs",
     "or use `masks`": "or use Import Masks",
+    "which --text and --detector are for": "which Names is for",
+    "choose a folder with one as MASKS": "clear Names, or choose a folder with one",
 }
 """Advice that has other words in Blender."""
 _ONLY_TYPED = (

@@ -46,6 +46,7 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
 
     names: StringProperty(
         name="Names",
+        options={"SKIP_SAVE"},
         description="For a folder with a checkpoint: names of the objects to find, in English, with semicolons between "
         "them, such as red cup; book. SAM 3 finds them itself, and for others the Detection Model of the preferences "
         "does. If empty, all segments are found, without names",

@@ -27,7 +27,12 @@ class CleanUpLabels(bpy.types.Operator):
         if not loses_splat_edits(context):
             return self.execute(context)
         return context.window_manager.invoke_confirm(
-            self, event, title="Lose Edits of Splats?", message=LOST_EDITS, confirm_text="Clean Up Labels", icon="WARNING"
+            self,
+            event,
+            title="Lose Edits of Splats?",
+            message=LOST_EDITS,
+            confirm_text="Clean Up Labels",
+            icon="WARNING",
         )
 
     def execute(self, context: bpy.types.Context) -> set[str]:

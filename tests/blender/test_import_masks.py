@@ -66,6 +66,8 @@ def test_names_are_asked_for_with_the_model_of_the_preferences(root, submitted, 
         bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(given), names=names)
         command = submitted[-1].command
         assert command[command.index("--objects") + 2 :] == [*options, "--json"]
+    kept = bpy.ops.objectgs.import_masks.get_rna_type().properties["names"]
+    assert kept.is_skip_save, "the masks of the next import may have no model"
 
 
 def test_folder_is_chosen_with_or_without_a_name_in_it(root, submitted, tmp_path):
