@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from pycocotools import mask as coco_masks
 
+from backend.capture import load_capture
 from backend.capture.files import read_mask
 from backend.capture.mask_sources import open_source
 from backend.capture.mask_sources.label_studio import unpack
@@ -294,6 +295,17 @@ def test_masks_of_a_missing_photo_are_left_out(write_capture, tmp_path, run_comm
     (scene.folder / "images" / scene.names[2]).unlink()
     assert run_command("masks", scene.folder, given, "--objects", "given").code == EXIT_DONE
     assert len(list((scene.folder / "masks").glob("*.png"))) == 5
+
+
+def test_photos_may_be_spelled_differently_in_the_model(write_capture, tmp_path, run_command):
+    scene = write_capture(views=6)
+    given = (scene.folder / "masks").rename(tmp_path / "given")
+    for path in (scene.folder / "images").iterdir():
+        path.rename(path.with_name(path.name.upper()))
+    done = run_command("masks", scene.folder, given)
+    assert done.code == EXIT_DONE, done.err
+    assert len(list((scene.folder / "masks").glob("*.png"))) == 6
+    assert load_capture(scene.folder, tmp_path / "cache").has_masks
 
 
 def test_imported_masks_of_few_photos_can_be_used(write_capture, tmp_path, run_command):

@@ -101,9 +101,8 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     own = Photos(capture)
     images, names = own.folder, own.names
     if model is not None:
-        # A photo that is missing is no reason to refuse the masks of the others.
-        there = Files(images)
-        names = sorted(image.name for image in model.images if there.find(image.name) is not None)
+        model = _with_names_of_files(model, images)
+        names = sorted(image.name for image in model.images)
     if not names:
         raise InputError(f"{capture / 'images'} contains no photos; put them there.")
     _require_replaceable(capture, given)
@@ -140,6 +139,17 @@ def _model(capture: Path, needed: bool) -> Model | None:
         if needed:
             raise InputError(f"Objects are found by the points of the photos: {error}") from error
         return None
+
+
+def _with_names_of_files(model: Model, images: Path) -> Model:
+    """Return the model with the photos that exist, which may be spelled differently in it, by the names of their files.
+
+    A photo that is missing is no reason to refuse the masks of the others.
+    """
+    there = Files(images)
+    found = [(image, there.find(image.name)) for image in model.images]
+    present = [replace(image, name=path.relative_to(images).as_posix()) for image, path in found if path is not None]
+    return replace(model, images=present)
 
 
 def _segmented(options: argparse.Namespace, names: Sequence[str], reporter: StoppingReporter) -> MaskSource:
