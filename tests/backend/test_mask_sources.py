@@ -279,6 +279,16 @@ def test_frames_of_a_video_are_the_photos_in_the_folder(photos, tmp_path, run_co
     assert run_command("masks", photos, path).code == EXIT_DONE
 
 
+def test_folders_of_objects_have_those_of_the_photos(photos, tmp_path):
+    given = tmp_path / "given"
+    for camera in ("left", "right"):
+        (photos / "images" / camera).mkdir()
+        (given / "mug" / camera).mkdir(parents=True)
+        Image.new("RGB", SIZE).save(photos / "images" / camera / "0001.jpg")
+        Image.fromarray(255 * masks_of(0)).save(given / "mug" / camera / "0001.png")
+    assert open_source(given, photos, ["left/0001.jpg"]).photos == ["left/0001.jpg", "right/0001.jpg"]
+
+
 def test_255_is_white_only_where_all_masks_are_black_and_white(photos, tmp_path):
     for values, expected in (((0, 255), {1}), ((0, 85, 255), {85, 255})):
         given = tmp_path / str(len(values))

@@ -96,9 +96,10 @@ class MaskFolders:
             if not is_image or path.parent == folder:
                 continue
             within = PurePosixPath(path.relative_to(folder).as_posix())
+            own = PurePosixPath(*within.parts[1:])
             if (name := photos.find(within.parent.as_posix())) is not None:
                 by_photo.setdefault(name, []).append((path, ""))
-            elif (name := photos.find("/".join(within.parts[1:]))) is not None:
+            elif (name := photos.find(own.as_posix()) or photos.find(own.with_suffix("").as_posix())) is not None:
                 by_object.setdefault(name, []).append((path, within.parts[0]))
         self._has_objects = len(by_object) >= len(by_photo)
         self._shapes = by_object if self._has_objects else by_photo
