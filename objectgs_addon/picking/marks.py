@@ -70,9 +70,10 @@ def count(root: bpy.types.Collection, object_id: int) -> int:
 def names_without_strokes(root: bpy.types.Collection) -> list[str]:
     """Return the names of the listed objects that no stroke marks, so that the next separation makes them background.
 
-    Objects of single splats are none of these: a separation leaves them as they are.
+    Objects of single splats are none of these: a separation leaves them as they are. Nor are those that are merged.
     """
-    marked = {NOTHING, *(stroke["object"] for stroke in strokes_of(root))}
+    strokes = strokes_of(root)
+    marked = {NOTHING, *(stroke["object"] for stroke in strokes), *(stroke.get("merged") for stroke in strokes)}
     return [
         item.name
         for item in root.objectgs.objects
@@ -161,12 +162,17 @@ def _place_of(stroke: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge_object(root: bpy.types.Collection, index: int, into: int) -> None:
-    """Make an object of the list a part of another one, which gets what both are now; index, into: their rows."""
+    """Make an object of the list a part of another one, which gets what both are now; index, into: their rows.
+
+    Its strokes keep the ID that it had, as `merged`.
+    """
     properties = root.objectgs
     object_id, other = properties.marked[index].object_id, properties.marked[into].object_id
     first = 1 + max((_part_of(stroke) for stroke in strokes_of(root) if stroke["object"] == other), default=0)
     strokes = [
-        {**stroke, "object": other, "part": first + _part_of(stroke)} if stroke["object"] == object_id else stroke
+        {"merged": object_id, **stroke, "object": other, "part": first + _part_of(stroke)}
+        if stroke["object"] == object_id
+        else stroke
         for stroke in strokes_of(root)
     ]
     properties.marked.remove(index)

@@ -171,6 +171,11 @@ def test_objects_without_strokes_are_named_before_they_are_lost(root, monkeypatc
     marks.add_stroke(root, blender_scene.from_stored(rows[0][0]), views(root)[0], [(1, 1)], area=False)
     root.objectgs.objects[1].separated = True
     assert marks.names_without_strokes(root) == [name for _, name in rows[2:]]
+    for object_id, _ in (rows[0], rows[2]):
+        root.objectgs.marked.add().object_id = object_id
+    marks.add_stroke(root, blender_scene.from_stored(rows[2][0]), views(root)[0], [(1, 1)], area=False)
+    marks.merge_object(root, 1, into=0)
+    assert marks.names_without_strokes(root) == [name for _, name in rows[3:]], "merged objects do not become background"
 
 
 def test_what_is_removed_belongs_to_no_object(root):
