@@ -32,12 +32,20 @@ _FAR = 1e4
 
 after_strokes: list[Callable[[bpy.types.Collection], object]] = []
 """Called with a reconstruction whose strokes have changed."""
+after_colors: list[Callable[[bpy.types.Collection], object]] = []
+"""Called with a reconstruction of which the color of a marked object was set."""
 
 
 def strokes_changed(properties: Any, _context: bpy.types.Context = None) -> None:
     """Tell of changed strokes; an update of a property."""
     for action in after_strokes:
         action(properties.id_data)
+
+
+def color_set(item: Any, _context: bpy.types.Context = None) -> None:
+    """Tell of the color of a marked object; an update of a property."""
+    for action in after_colors:
+        action(item.id_data)
 
 
 def strokes_of(root: bpy.types.Collection) -> list[dict[str, Any]]:

@@ -43,13 +43,17 @@ class _Session:
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.problem, self.said, self.said_passes = "", "", False
         self.asked = self.answered = 0
+        self.is_proposing = False
         self._asked_strokes: list[dict[str, Any]] = []
         self._answered_strokes: list[dict[str, Any]] = []
         self.taken: tuple[int, int, float] | None = None
         self.wanted_detail: float | None = None
+        self.colors: dict[int, tuple[float, ...]] = {}
         self.lacks = False
         self.proposed: dict[str, Any] | None = None
         self._parts: list[np.ndarray] = []
+        self._order = np.argsort(self.keys)
+        self._places: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.objects: np.ndarray = np.zeros(1, np.int64)
         self.classes = np.zeros(len(self.keys), np.int64)
 
@@ -57,6 +61,7 @@ class _Session:
         """Send the strokes; what is shown until the answer is that of earlier ones."""
         if not self.ready:
             return
+        self.is_proposing = False
         if not content["strokes"]:
             self.objects, self.classes = np.zeros(1, np.int64), np.zeros(len(self.keys), np.int64)
             self.asked = self.answered = self.asked + 1
@@ -71,6 +76,7 @@ class _Session:
         self.wanted_detail = None if self.ready else detail
         if self.ready:
             self.asked += 1
+            self.is_proposing = True
             self.process.send(json.dumps({"request": self.asked, "propose": True, "detail": detail}))
 
     def take(self, event: dict[str, Any]) -> int | None:
@@ -96,6 +102,7 @@ class _Session:
             if not self.ready:
                 self.failure = "The splats in the folder are not those of its training; train again."
         elif kind == "answer" and event.get("request") == self.asked:
+            self.is_proposing = False
             if "proposed" in event:
                 self.answered, self.proposed = self.asked, dict(event["proposed"])
                 return None
@@ -138,6 +145,16 @@ class _Session:
         ]
         most = max(found, key=lambda each: each[2], default=None)
         return most if most is not None and most[2] > _NOTICEABLE else None
+
+    def places(self, mesh: bpy.types.Mesh) -> np.ndarray:
+        """Return the place (n,) of each splat of a mesh in `classes`, -1 for none; kept for each mesh."""
+        keys = scene.keys_of(mesh)
+        known = self._places.get(mesh.session_uid)
+        if known is None or not np.array_equal(known[0], keys):
+            at = np.minimum(np.searchsorted(self.keys, keys, sorter=self._order), len(self._order) - 1)
+            own = self._order[at]
+            known = self._places[mesh.session_uid] = keys, np.where(self.keys[own] == keys, own, -1)
+        return known[1]
 
     def say(self, text: str, kind: str = "INFO", passes: bool = False) -> None:
         """Show a message on the marks instead of the earlier one; "" for none.
@@ -254,8 +271,23 @@ def refresh(root: bpy.types.Collection) -> None:
     if _session is not None and _session.root == root.session_uid:
         if _session.said_passes:
             _session.say("")
+        was_proposing = _session.is_proposing
         _session.ask(marks.content(root))
+        if was_proposing:
+            _session.say("The marks have changed, so Suggest Objects was canceled; press it again", passes=True)
         show()
+
+
+def recolor(root: bpy.types.Collection) -> None:
+    """Show the colors of the marked objects if those have changed."""
+    if _session is not None and _session.root == root.session_uid and _session.colors != _colors(root, _session):
+        show()
+
+
+def _colors(root: bpy.types.Collection, session: _Session) -> dict[int, tuple[float, ...]]:
+    """Return the colors of the marked objects that splats belong to, by ID."""
+    marked = {item.object_id: tuple(item.color) for item in root.objectgs.marked}
+    return {object_id: marked[object_id] for object_id in session.objects.tolist() if object_id in marked}
 
 
 @writing.allowed
@@ -277,8 +309,9 @@ def _tick() -> float | None:
             session.say(session.problem, "ERROR", passes=True)
             session.problem = ""
     if session.ready and not was_ready:
-        session.ask(marks.content(root))
-        if session.wanted_detail is not None:
+        if session.wanted_detail is None:
+            session.ask(marks.content(root))
+        else:
             session.propose(session.wanted_detail)
     if session.proposed is not None:
         _show_proposed(root, session)
@@ -317,6 +350,8 @@ def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
     proposed, session.proposed = session.proposed, None
     if not proposed or proposed.get("strokes") == []:
         session.say("No objects were found by their shape; try another Detail, or draw over them")
+        # The marks may not have been answered yet.
+        session.ask(marks.content(root))
         return
     try:
         marks.set_proposed(root, proposed)
@@ -339,11 +374,10 @@ def show() -> None:
     root = next((each for each in bpy.data.collections if session and each.session_uid == session.root), None)
     if session is None or root is None:
         return
-    colors = {item.object_id: tuple(item.color) for item in root.objectgs.marked}
-    shown = [object_id for object_id in session.objects.tolist() if object_id in colors]
+    session.colors = colors = _colors(root, session)
+    shown = list(colors)
     number_of = np.array([shown.index(i) + 1 if i in colors else 0 for i in session.objects.tolist()], np.int64)
     numbers = number_of[session.classes]
-    order = np.argsort(session.keys)
     found: dict[bpy.types.Mesh, np.ndarray] = {}
     for part in root.all_objects:
         if scene.kind_of(part) != session.kind or part.data.is_editmode:
@@ -351,10 +385,7 @@ def show() -> None:
         if session.kind == "points":
             found[part.data] = numbers
         else:
-            keys = scene.keys_of(part.data)
-            at = np.minimum(np.searchsorted(session.keys, keys, sorter=order), len(order) - 1)
-            own = order[at]
-            found[part.data] = np.where(session.keys[own] == keys, numbers[own], 0)
+            found[part.data] = np.append(numbers, 0)[session.places(part.data)]
     drawing.show_labels(found, np.array([colors[i] for i in shown]).reshape(-1, 3))
     drawing.redraw()
 
@@ -376,10 +407,12 @@ def _file_loads(*_: Any) -> None:
 
 def register() -> None:
     marks.after_strokes.append(refresh)
+    marks.after_colors.append(recolor)
     bpy.app.handlers.load_pre.append(_file_loads)
 
 
 def unregister() -> None:
     stop()
     bpy.app.handlers.load_pre.remove(_file_loads)
+    marks.after_colors.remove(recolor)
     marks.after_strokes.remove(refresh)

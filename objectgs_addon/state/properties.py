@@ -124,7 +124,13 @@ class MarkedObject(bpy.types.PropertyGroup):
     name: StringProperty(name="Name", description="Name of the object")
     object_id: IntProperty(name="ID")
     color: FloatVectorProperty(
-        name="Color", description="Color in which the object is shown", subtype="COLOR_GAMMA", size=3, min=0.0, max=1.0
+        name="Color",
+        description="Color in which the object is shown",
+        subtype="COLOR_GAMMA",
+        size=3,
+        min=0.0,
+        max=1.0,
+        update=marks.color_set,
     )
 
 

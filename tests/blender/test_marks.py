@@ -427,6 +427,39 @@ def test_marks_stay_if_no_objects_are_proposed(root, session):
     assert (len(root.objectgs.marked), marks.content(root)) == before and "No objects were found" in session.said
 
 
+def test_marks_and_suggestions_do_not_cancel_each_other_silently(root, session, monkeypatch):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
+    marks.add_stroke(root, marks.add_object(root).object_id, views(root)[0], [(1, 1)], area=False)
+    pointing.propose(root)
+    session.process.events = [{"type": "answer", "ready": True, "splats": len(session.keys)}]
+    pointing._tick()
+    assert [each["request"] for each in session.process.sent] == [1] and session.process.sent[0]["propose"]
+    session.process.events = [{"type": "answer", "request": 1, "proposed": {"strokes": [], "everything": True}}]
+    pointing._tick()
+    assert session.process.sent[-1]["strokes"] == marks.strokes_of(root), "the marks that are kept are asked for"
+    session.propose(0.5)
+    marks.add_stroke(root, 1, views(root)[0], [(2, 2)], area=False)
+    assert "Suggest Objects was canceled" in told[-1]
+    count = len(told)
+    marks.add_stroke(root, 1, views(root)[0], [(3, 3)], area=False)
+    assert len(told) == count
+
+
+def test_colors_of_marked_objects_are_shown_when_they_are_set(root, session, monkeypatch):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    item = marks.add_object(root)
+    marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1)], area=False)
+    answer(session, [0, item.object_id], np.arange(len(session.keys)) % 2)
+    pointing.show()
+    shown = []
+    monkeypatch.setattr(drawing, "show_labels", lambda _labels, colors: shown.append(colors))
+    item.color = (0.25, 0.5, 0.75)
+    item.color = (0.25, 0.5, 0.75)
+    marks.add_object(root)
+    assert len(shown) == 1 and np.allclose(shown[0], (0.25, 0.5, 0.75)), "once, and not for an object without splats"
+
+
 def test_invalid_proposals_end_the_process_with_a_sentence(root, session):
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     session.propose(0.6)
