@@ -367,6 +367,14 @@ def test_one_list_of_objects_is_open(root, session):
     assert "OBJECTGS_UL_marked" in texts_of(MarkingPanel)
 
 
+def test_panel_says_why_marks_are_not_shown(root, session):
+    assert "not shown" not in texts_of(MarkingPanel)
+    bpy.context.scene.objectgs.draw_splats = False
+    assert "switch Draw Splats on" in texts_of(MarkingPanel)
+    pointing.stop()
+    assert "not shown" not in texts_of(MarkingPanel)
+
+
 def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatch, tmp_path):
     monkeypatch.setattr(pointing, "BackendProcess", _Process)
     for chosen, options in (("", []), (str(tmp_path / "sam2"), ["--segmenter", str(tmp_path / "sam2")])):

@@ -77,6 +77,8 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
                 return
         else:
             self._draw_state(layout, root)
+            if folder_trust.state_of(root).trained and (hidden := _why_hidden(context)):
+                write(layout, hidden, "HIDE_ON")
         if (model := locations.segmenter()) is not None:
             write(layout, f"A stroke marks all that {model.name} segments by it.", "INFO")
         if is_active or not properties.objects:
@@ -112,6 +114,15 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
         write(layout, text, "INFO", rows=_ROWS)
+
+
+def _why_hidden(context: bpy.types.Context) -> str:
+    """Return why a viewport does not show the marks on splats, and what to do; "" if it shows them."""
+    if not context.scene.objectgs.draw_splats:
+        return "The marks are not shown; switch Draw Splats on in the panel ObjectGS."
+    if context.space_data is not None and not context.space_data.overlay.show_overlays:
+        return "The marks are not shown; switch the viewport's overlays on."
+    return ""
 
 
 def _draw_list(layout: bpy.types.UILayout, properties: Any) -> None:
