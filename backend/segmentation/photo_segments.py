@@ -94,7 +94,7 @@ class PhotoSegments:
                 progress(done + step / (steps + 1), len(missing))
 
             found = self._finder.find(np.array(photo), report)
-            self._keep(name, draw_shapes((Shape(mask, None, text) for mask, text in found), photo.size))
+            self._keep(name, draw_shapes((Shape.of(mask, None, text) for mask, text in found), photo.size))
             progress(done + 1, len(missing))
 
     def read(self, photo: str) -> Segments:

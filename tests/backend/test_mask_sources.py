@@ -12,7 +12,7 @@ from backend.capture import load_capture
 from backend.capture.files import read_mask
 from backend.capture.mask_sources import open_source
 from backend.capture.mask_sources.label_studio import unpack
-from backend.capture.mask_sources.segments import run_lengths
+from backend.capture.mask_sources.segments import Shape, draw_shapes, run_lengths
 from backend.film.cryptomatte import header, name_bits
 from backend.sfm.sources.photos import take_photos
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
@@ -404,6 +404,16 @@ def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):
     assert run_command("masks", photos, given).code == run_command("masks", photos, given).code == EXIT_DONE
     (photos / "masks" / "masks.json").unlink()
     assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
+
+
+def test_segments_take_no_more_memory_than_their_boxes():
+    large, small, none = (np.zeros((300, 400), bool) for _ in range(3))
+    large[10:90, 20:60], small[50:70, 30:50] = True, True
+    shapes = [Shape.of(small, "b", "box"), Shape.of(none, "c", ""), Shape.of(large, "a", "mug")]
+    assert sum(shape.inside.size for shape in shapes) == 80 * 40 + 20 * 20
+    drawn = draw_shapes(shapes, (400, 300))
+    assert drawn.objects == ["a", "b"] and drawn.names == ["mug", "box"]
+    assert np.array_equal(drawn.numbers, large + small.astype(np.int32))
 
 
 def test_decoders_refuse_what_does_not_fit():

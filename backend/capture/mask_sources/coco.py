@@ -94,7 +94,7 @@ class CocoMasks:
             for corners in described or ():
                 inside |= polygon(list(zip(corners[::2], corners[1::2], strict=True)), size)
         name = self._names.get(annotation.get("category_id"), "")
-        return Shape(inside, self._object(annotation, name), name)
+        return Shape.of(inside, self._object(annotation, name), name)
 
     def _panoptic(self, photo: str) -> Segments:
         described = [each for each in self._annotations[photo] if "segments_info" in each]
@@ -110,7 +110,7 @@ class CocoMasks:
         shapes = []
         for segment in described[0]["segments_info"]:
             label = self._names.get(segment.get("category_id"), "")
-            shapes.append(Shape(ids == segment["id"], self._object(segment, label), label))
+            shapes.append(Shape.of(ids == segment["id"], self._object(segment, label), label))
         return draw_shapes(shapes, ids.shape[::-1])
 
     def _object(self, annotation: Mapping[str, Any], name: str) -> Hashable:
@@ -162,7 +162,7 @@ class PhotoJson:
                 raise ValueError(f"{len(sizes)} different sizes of masks")
             height, width = next(iter(sizes))
             size = checked_size(width, height, str(path))
-            shapes = [Shape(run_lengths(each["segmentation"]["counts"], size), None, "") for each in masks]
+            shapes = [Shape.of(run_lengths(each["segmentation"]["counts"], size), None, "") for each in masks]
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{path} is not valid ({error}); expected masks as run lengths, as in COCO.") from error
         return draw_shapes(shapes, size)

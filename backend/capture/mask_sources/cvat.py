@@ -89,7 +89,7 @@ class CvatMasks:
             except (TypeError, ValueError, KeyError) as error:
                 raise self._invalid(error, photo) from error
             known = track if track is not None else label if label and self._is_unique else None
-            shapes.append(Shape(inside, known, label))
+            shapes.append(Shape.of(inside, known, label))
         return draw_shapes(shapes, size)
 
     def _invalid(self, error: Exception, photo: str = "") -> InputError:

@@ -114,7 +114,7 @@ class MaskFolders:
             if size is not None and inside.shape != size:
                 raise InputError(f"{path} is not of the size of the other masks of {photo}; make it the photo's size.")
             size = inside.shape
-            shapes.append(Shape(inside, name or None, name))
+            shapes.append(Shape.of(inside, name or None, name))
         assert size is not None
         return draw_shapes(shapes, size[::-1])
 

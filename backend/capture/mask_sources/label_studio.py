@@ -65,7 +65,7 @@ class LabelStudioMasks:
             size = checked_size(results[0]["original_width"], results[0]["original_height"], f"{self._file}: {photo}")
             for each in results:
                 label = _label(each)
-                shapes.append(Shape(_inside(each, size), label if label and self._is_unique else None, label))
+                shapes.append(Shape.of(_inside(each, size), label if label and self._is_unique else None, label))
         except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
             raise self._invalid(error, photo) from error
         return draw_shapes(shapes, size)

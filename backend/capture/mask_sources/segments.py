@@ -47,11 +47,24 @@ class MaskSource(Protocol):
 
 
 class Shape(NamedTuple):
-    """One segment before it is drawn: its pixels (h, w) bool, and its object and name as in `Segments`."""
+    """One segment before it is drawn: the pixels (h, w) bool of its box, and its object and name as in `Segments`."""
 
     inside: np.ndarray
+    box: tuple[slice, slice]
     object: Hashable
     name: str
+
+    @classmethod
+    def of(cls, inside: np.ndarray, which: Hashable, name: str) -> Shape:
+        """Keep the box of a photo's pixels (H, W) bool, since those of all segments would take much memory."""
+        box = _extent(inside.any(1)), _extent(inside.any(0))
+        return cls(inside[box].copy(), box, which, name)
+
+
+def _extent(line: np.ndarray) -> slice:
+    """Return the part of a line (n,) bool from the first to the last pixel that is inside."""
+    places = np.flatnonzero(line)
+    return slice(int(places[0]), int(places[-1]) + 1) if len(places) else slice(0, 0)
 
 
 def draw_shapes(shapes: Iterable[Shape], size: tuple[int, int]) -> Segments:
@@ -59,7 +72,7 @@ def draw_shapes(shapes: Iterable[Shape], size: tuple[int, int]) -> Segments:
     numbers = np.zeros(size[::-1], np.int32)
     ordered = sorted((shape for shape in shapes if shape.inside.any()), key=lambda shape: -int(shape.inside.sum()))
     for number, shape in enumerate(ordered, 1):
-        numbers[shape.inside] = number
+        numbers[shape.box][shape.inside] = number
     return Segments(numbers, [shape.object for shape in ordered], [shape.name for shape in ordered])
 
 
