@@ -247,8 +247,11 @@ def test_contributions_are_blending_weights(unlabeled) -> None:
 
 
 def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_command) -> None:
-    """A stroke that shows nothing is left out, since others mark its object."""
+    """A stroke that shows nothing is left out, since others mark its object; masks of another folder are replaced."""
     scene, out = unlabeled
+    beside = scene.folder / "masks" / "strokes.json"
+    beside.parent.mkdir()
+    beside.write_text(json.dumps({"reconstruction": str(tmp_path)}))
     content = strokes_on(scene, (1, 5, 9))
     view = load_capture(scene.folder, tmp_path / "cache").views[0]
     away = {"viewmat": (np.diag([-1.0, 1, -1, 1]) @ view.viewmat).tolist(), "intrinsics": [90, 90, 48, 36]}
@@ -256,7 +259,9 @@ def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_c
     strokes = strokes_file(tmp_path, content)
     result = run_command("label", out, "--strokes", strokes, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["objects"] == 3
-    assert [text for text in result.messages("warning") if "Stroke 1 shows no splats" in text]
+    warnings = " ".join(result.messages("warning"))
+    assert "Stroke 1 shows no splats" in warnings and f"that in {tmp_path}, and is replaced" in warnings
+    assert json.loads(beside.read_text()) == {**content, "reconstruction": str(out.resolve())}
     assert json.loads((scene.folder / "labels.json").read_text())["1"] == "ball"
     assert result.events[-1]["steps"] == 180, "a fifth more than before"
     capture = load_capture(scene.folder, tmp_path / "again")

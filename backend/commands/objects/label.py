@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
-from ...shared.formats.json_file import write_json
+from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
-from ...shared.reconstruction.folder import STROKES
+from ...shared.reconstruction.folder import STROKES, Reconstruction
 from ...shared.reconstruction.objects import default_name, forget_vanished
 from ...shared.reconstruction.plan import write_plan
 from ...shared.reconstruction.record import update_record
@@ -46,6 +46,8 @@ from ..votes import cast_votes, votes_key
 from .pointable import GRAPH, Pointable, open_pointable, require_splats, segmentation
 
 _MASKS, _TRAIN = "masks", "train"
+_OWNER = "reconstruction"
+"""Entry of the strokes beside the masks that are made of them: the folder of the reconstruction."""
 _UNTRAINED = {GRAPH: ("Preparing", 5.0), EXPORT: ("Saving", 5.0)}
 """Parts of the command for splats without a training."""
 
@@ -73,6 +75,11 @@ def _label_trained(
     """Find the objects, write masks of the photos, and train the objects' borders."""
     capture, device = trained.capture, opened.device
     _require_own_masks(capture)
+    if (other := _other_owner(capture, trained.folder)) is not None:
+        reporter.warning(
+            f"{capture.folder / 'masks'} has the masks of another reconstruction's strokes, that in {other}, and is "
+            "replaced; to go on with the other one, separate its objects again."
+        )
     strokes = read_strokes(options.strokes, opened.views.names)
     segment = segmentation(options, device)
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
@@ -83,7 +90,7 @@ def _label_trained(
         pointer = opened.pointer(reporter.progress, segment)
         ids = _solve(pointer, strokes, reporter)
         reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
-        _write_masks(capture, pointer, ids, strokes, options, reporter)
+        _write_masks(trained, pointer, ids, strokes, options, reporter)
     trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
     train_borders(trained, trainer, reporter)
     reporter.done(
@@ -126,8 +133,17 @@ def _require_own_masks(capture: Capture) -> None:
             raise InputError(f"{path} was not made of strokes; move it elsewhere to make masks of strokes.")
 
 
+def _other_owner(capture: Capture, folder: Reconstruction) -> Path | None:
+    """Return the folder of another reconstruction, if there is one, of whose strokes the capture's masks were made."""
+    try:
+        owner = Path(read_json(capture.folder / "masks" / STROKES)[_OWNER])
+    except (InputError, KeyError, TypeError):
+        return None  # There are none, or an older version has made them.
+    return owner if owner.is_dir() and owner != folder.folder.resolve() else None
+
+
 def _write_masks(
-    capture: Capture,
+    trained: Trained,
     pointer: Pointer,
     ids: np.ndarray,
     strokes: Strokes,
@@ -135,11 +151,12 @@ def _write_masks(
     reporter: StoppingReporter,
 ) -> None:
     """Write masks of the training photos, which replace those of earlier strokes when complete, and labels.json."""
+    capture, owner = trained.capture, str(trained.folder.folder.resolve())
     with new_masks(capture.folder) as folder:
         for done, (index, mask) in enumerate(pointer.masks(ids), 1):
             write_mask(folder, capture.views[index].name, capture.photo_mask(index, mask))
             reporter.progress(done, len(capture.train_indices), what="photos")
-        shutil.copyfile(options.strokes, folder / STROKES)
+        write_json(folder / STROKES, {**read_json(options.strokes), _OWNER: owner})
     names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
     write_json(capture.folder / "labels.json", names)
 
