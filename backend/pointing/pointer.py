@@ -115,10 +115,10 @@ class Pointer:
                 errors[each] = error
         self._shown = found
         marked = {0, *(stroke.object for stroke, _ in found)}
-        for (stroke, _), error in errors.items():
+        for (stroke, _), shows_nothing in errors.items():
             if left_out is None or stroke.object not in marked:
-                raise error
-            left_out(error)
+                raise shows_nothing
+            left_out(shows_nothing)
         areas = [shown.area for shown in self._shown.values() if shown.area]
         seeds: dict[int, np.ndarray] = {}
         for (stroke, _), shown in self._shown.items():

@@ -342,7 +342,7 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
     edits = scene.shown_edits(root)
     if state.steps and edits is not None and edits.match:
         messages.show(
-            "Clean Up Labels gives the splats the objects of the new masks; deleted and separated splats come back then",
+            "Clean Up Labels gives splats the objects of the new masks; deleted and separated splats come back then",
             operator="objectgs.clean_up_labels", label="Clean Up Labels",
         )  # fmt: skip
         return

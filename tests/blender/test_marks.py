@@ -175,7 +175,7 @@ def test_objects_without_strokes_are_named_before_they_are_lost(root, monkeypatc
         root.objectgs.marked.add().object_id = object_id
     marks.add_stroke(root, blender_scene.from_stored(rows[2][0]), views(root)[0], [(1, 1)], area=False)
     marks.merge_object(root, 1, into=0)
-    assert marks.names_without_strokes(root) == [name for _, name in rows[3:]], "merged objects do not become background"
+    assert marks.names_without_strokes(root) == [name for _, name in rows[3:]], "merged ones are kept"
 
 
 def test_what_is_removed_belongs_to_no_object(root):

@@ -57,7 +57,7 @@ class Shape(NamedTuple):
     @classmethod
     def of(cls, inside: np.ndarray, which: Hashable, name: str) -> Shape:
         """Keep the box of a photo's pixels (H, W) bool, since those of all segments would take much memory."""
-        box = _extent(inside.any(1)), _extent(inside.any(0))
+        box = _extent(np.any(inside, 1)), _extent(np.any(inside, 0))
         return cls(inside[box].copy(), box, which, name)
 
 
