@@ -42,9 +42,9 @@ VALIDATE_EVERY, MAX_VALIDATION_VIEWS, MIN_TRAINED_VIEWS = 8, 20, 16
 than the third number of views would be left to train on: the few that could be would cost the model more than they
 tell about it."""
 
-DECAY_FROM = 0.9
-"""Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; later than
-other trainings, since the model on the plateau is as good as after an earlier decay with equally many steps."""
+DECAY_FROM = 0.8
+"""Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; in the rest, the
+validation views are trained on, too."""
 
 
 @dataclass

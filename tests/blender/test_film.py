@@ -3,6 +3,7 @@
 
 import math
 import os
+import shutil
 import subprocess
 import sys
 
@@ -19,12 +20,23 @@ from objectgs.backend.shared.reconstruction.record import TrainingRecord, VotesR
 from objectgs.backend.shared.reconstruction.shot import read_shot, write_shot
 from objectgs.objectgs_addon import film
 from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.film.properties import folder_of
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.object_collection import center_of
 
 import headless
 
-from .building import OBJECTS, look_at, splat_table, write_cameras, write_folder, write_objects, write_points
+from .building import (
+    OBJECTS,
+    look_at,
+    splat_table,
+    tetrahedron,
+    write_cameras,
+    write_folder,
+    write_meshes,
+    write_objects,
+    write_points,
+)
 
 ORIGIN = np.array([100.0, -200.0, 30.0])
 
@@ -163,6 +175,32 @@ def test_animation_is_sampled_in_every_frame(root):
             assert_placed(root, shot, frame.samples[0], object_id, splats_of(root, object_id))
     lenses = [frame.samples[0].K[0, 0] for frame in shot.frames]
     assert lenses[0] < lenses[1] < lenses[2]
+
+
+def test_object_that_rests_in_a_part_of_its_animation_is_placed_there(root):
+    """The timeline may stand where it is elsewhere, as on a farm that renders a part of the frames."""
+    scene, pivot = bpy.context.scene, ensure_pivot(root, 1)
+    captured_at = pivot.location.x
+    for frame, moved in ((1, 0.0), (5, 0.0), (9, 2.0)):
+        pivot.location.x = captured_at + moved
+        pivot.keyframe_insert("location", frame=frame)
+    scene.frame_set(9)
+    first, second = (frame.samples[0].objects for frame in shoot(root, (1, 3)).frames)
+    for objects in (first, second):
+        np.testing.assert_array_equal(objects[1].maps, np.eye(4)[None])
+        assert objects[2].maps is None, "an object that cannot move keeps its place of objects.json"
+
+
+def test_whole_scene_mesh_does_not_hide_the_rest(root):
+    folder = blender_scene.folder_of(root)
+    write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
+    blender_scene.show_meshes(root, folder)
+    blender_scene.show_kinds(root, "meshes")
+    assert splats_of(root, 0).hide_render
+    assert 0 in shoot(root).frames[0].samples[0].objects
+    for mesh in blender_scene.scene_meshes(root):
+        mesh.hide_render = True
+    assert 0 not in shoot(root).frames[0].samples[0].objects
 
 
 def test_objects_that_grow_from_nothing_are_omitted_until_then(root, tmp_path):
@@ -343,6 +381,15 @@ def test_unsupported_cameras_are_rejected(root):
         scene.camera.data.type = kind
         with pytest.raises(InputError, match=word):
             shoot(root)
+    scene.camera.data.type = "PERSP"
+    scene.camera.scale.x = -1.0
+    bpy.context.view_layer.update()
+    with pytest.raises(InputError, match="Film is mirrored"):
+        shoot(root)
+    scene.camera.scale = (3.0, 1.0, 2.0)
+    bpy.context.view_layer.update()
+    viewmat = shoot(root).frames[0].samples[0].viewmat[:3, :3]
+    np.testing.assert_allclose(viewmat @ viewmat.T, np.eye(3), atol=1e-6)
     scene.camera = None
     with pytest.raises(InputError, match="no camera"):
         shoot(root)
@@ -548,7 +595,7 @@ def test_blender_reads_cryptomattes(filmed, backend_python):
     assert matte[RIGHT_WALL] > 0.98 and matte[LEFT_WALL] < 0.02
 
 
-def test_compositor_setup_is_idempotent(shot_blend, filmed):
+def test_compositor_setup_is_idempotent(shot_blend, filmed, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
     scene, layer = bpy.context.scene, bpy.context.view_layer
     root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
@@ -566,6 +613,13 @@ def test_compositor_setup_is_idempotent(shot_blend, filmed):
     node = next(node for node in tree.nodes if node.type == "IMAGE")
     assert (node.frame_start, node.frame_offset, node.frame_duration) == (7, 6, 1)
     assert node.image.source == "SEQUENCE" and not [link for link in tree.links if not link.is_valid]
+    other = bpy.data.collections.new("another")
+    scene.collection.children.link(other)
+    kinds.mark(other, "reconstruction")
+    second = tmp_path / "frames"
+    shutil.copytree(filmed, second)
+    film.set_up_compositor(scene, layer, other, second)
+    assert other.hide_render and not root.hide_render, "renders no longer show its frames"
 
 
 def test_compositor_setup_keeps_existing_nodes(shot_blend, filmed):
@@ -645,6 +699,13 @@ def test_film_operators_use_panel_settings(shot_blend, backend_python, registere
     with pytest.raises(RuntimeError, match="The output folder frames is relative"):
         bpy.ops.objectgs.film_frames()
     scene.objectgs_film.folder = str(tmp_path / "frames")
+    other = bpy.data.collections.new("another")
+    scene.collection.children.link(other)
+    kinds.mark(other, "reconstruction")
+    own = blender_scene.folder_of(root)
+    assert folder_of(scene, own) == tmp_path / "frames" / own.name, "each has a folder of its own"
+    bpy.data.collections.remove(other)
+    assert folder_of(scene, own) == tmp_path / "frames"
     camera, scene.camera = scene.camera, None
     assert not bpy.ops.objectgs.film_frames.poll()
     scene.camera = camera

@@ -19,6 +19,7 @@ from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
+from objectgs.objectgs_addon.scene.meshes import export as mesh_export
 from objectgs.objectgs_addon.state.folder_state import folder_state
 
 import headless
@@ -420,6 +421,58 @@ def test_scene_without_objects_shows_scene_mesh(fresh, folder):
     assert hidden(blender_scene.scene_meshes(root)) == {False} and hidden(parts(root, 0, "splats")) == {True}
     blender_scene.show_kinds(root, "splats")
     assert hidden(blender_scene.scene_meshes(root)) == {True} and hidden(parts(root, 0, "splats")) == {False}
+
+
+def test_scene_mesh_is_exported_where_no_object_has_one(fresh, folder, tmp_path):
+    write_vertices(folder / "splats.ply", splat_table(np.zeros(20, int)))
+    write_meshes(folder, {"scene": tetrahedron(ORIGIN), "pair": tetrahedron(ORIGIN + 5)}, ids={"pair": [1, 2]})
+    root = blender_scene.show_capture(bpy.context.scene, folder)
+    blender_scene.show_result(root, folder)
+    shown, other = sorted(blender_scene.scene_meshes(root), key=lambda mesh: "pair" in mesh.name)
+    other.hide_render = True
+    bpy.context.view_layer.update()
+    assert mesh_export.export(root, tmp_path / "all.obj", "obj", None, False, False) == [tmp_path / "all.obj"]
+    assert positions_in(tmp_path / "all.obj") == pytest.approx(coordinates(shown), abs=1e-4)
+    (each,) = mesh_export.export(root, tmp_path / "each", "obj", None, True, False)
+    assert each == tmp_path / "each" / "name_of_scene_mesh.obj" and each.is_file()
+    with pytest.raises(InputError, match="No chosen object has a mesh"):
+        mesh_export.export(root, tmp_path / "one.obj", "obj", [1], False, False)
+
+
+def positions_in(path) -> np.ndarray:
+    """Return the vertices (V, 3) of an OBJ file, whose second axis is up, in Blender's axes."""
+    lines = [line.split()[1:4] for line in path.read_text().splitlines() if line.startswith("v ")]
+    return np.array(lines, float)[:, [0, 2, 1]] * [1, -1, 1]
+
+
+def test_export_places_keyframed_meshes(root, tmp_path):
+    """A click selects pivot and mesh, so that a keyframe is one of both."""
+    mesh, pivot = mesh_of(root, 1), parts(root, 1, "object_parent")[0]
+    for obj in (pivot, mesh):
+        for path in ("location", "rotation_euler", "scale"):
+            obj.keyframe_insert(path, frame=1)
+    bpy.context.scene.frame_set(1)
+    bpy.context.view_layer.update()
+    expected = coordinates(mesh)
+    mesh_export.export(root, tmp_path / "mug.glb", "glb", [1], False, False)
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=str(tmp_path / "mug.glb"))
+    (found,) = [obj for obj in set(bpy.data.objects) - before if obj.type == "MESH"]
+    bpy.context.view_layer.update()
+    corners = np.array(sorted({tuple(np.round(corner, 4)) for corner in coordinates(found)}))
+    assert corners == pytest.approx(np.array(sorted(map(tuple, expected))), abs=1e-3)
+    assert found.animation_data is None and mesh.animation_data is not None
+
+
+def test_export_keeps_shear(root, tmp_path):
+    mesh, pivot = mesh_of(root, 1), parts(root, 1, "object_parent")[0]
+    pivot.rotation_euler.z = 0.6
+    kinds.parent_of(root).scale = (1.0, 2.0, 0.5)
+    bpy.context.view_layer.update()
+    count = len(bpy.data.meshes)
+    mesh_export.export(root, tmp_path / "mug.obj", "obj", [1], False, False)
+    assert positions_in(tmp_path / "mug.obj") == pytest.approx(coordinates(mesh), abs=1e-4)
+    assert len(bpy.data.meshes) == count
 
 
 # Faults.

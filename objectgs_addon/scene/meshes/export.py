@@ -33,7 +33,8 @@ def export(
 ) -> list[Path]:
     """Write the meshes of objects and of their duplicates; removed objects and objects without a mesh are skipped.
 
-    If no object has a mesh, those of the whole scene or of sets of objects are written, where all are chosen.
+    If no object has a mesh and all are chosen, meshes of the whole scene or of sets of objects are written: those that
+    are shown, or else all.
 
     Args:
         root: the reconstruction's collection.
@@ -58,6 +59,7 @@ def export(
         if (ids is None or object_id in ids) and not scene.is_removed(collections[object_id])
     ]
     whole = scene.scene_meshes(root) if ids is None and not scene.object_meshes(root) else []
+    whole = [mesh for mesh in whole if not mesh.hide_render] or whole
     if not chosen and not whole:
         raise InputError(
             "No chosen object has a mesh, or all of them are removed; extract meshes, or choose other objects."
