@@ -43,12 +43,11 @@ def measure_agreement(model: pycolmap.Reconstruction, path: Path) -> Agreement:
     Each pair of posed photos has verified matches, whose angles to the epipolar planes of the poses are measured.
     """
     posed = {number: model.image(number) for number in model.reg_image_ids()}
+    names = [image.name for image in posed.values()]
     fits, matches = dict.fromkeys(posed, 0), dict.fromkeys(posed, 0)
     rays: dict[int, np.ndarray] = {}
     with pycolmap.Database.open(path) as stored:
-        for first, second, _, _ in database.verified_pairs(path):
-            if first not in posed or second not in posed:
-                continue
+        for first, second, _, _ in database.verified_pairs(path, names):
             inliers = stored.read_two_view_geometry(first, second).inlier_matches
             cameras = [model.camera(posed[number].camera_id) for number in (first, second)]
             for number, camera in zip((first, second), cameras, strict=True):

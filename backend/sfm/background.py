@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +16,16 @@ _MOST = 0.5
 """Fraction of a pair's matches that do not move, and of the pairs, above which the background stands still."""
 
 
-def stands_still(path: Path) -> bool:
+def stands_still(path: Path, names: Iterable[str]) -> bool:
     """Return whether most matches of most pairs of photos are at the same place in both.
 
     Photos by a moving camera have none: at most a tenth of the matches of one pair in a hundred.
 
     Args:
         path: the database with the verified matches.
+        names: the photos.
     """
-    pairs = database.verified_pairs(path)
+    pairs = database.verified_pairs(path, names)
     still = 0
     places: dict[int, np.ndarray] = {}
     with pycolmap.Database.open(path) as stored:

@@ -135,9 +135,8 @@ def _draw_matches(axes, names: Sequence[str], path: Path) -> None:  # type: igno
     ids = database.image_ids(path)
     order = {ids[name]: number for number, name in enumerate(names) if name in ids}
     counts = np.full((len(names), len(names)), np.nan)
-    for first, second, _, count in database.verified_pairs(path):
-        if first in order and second in order:
-            counts[order[first], order[second]] = counts[order[second], order[first]] = np.log10(count)
+    for first, second, _, count in database.verified_pairs(path, names):
+        counts[order[first], order[second]] = counts[order[second], order[first]] = np.log10(count)
     shown = axes.imshow(counts, cmap="Blues", vmin=1, vmax=3.2, interpolation="nearest")
     bar = axes.figure.colorbar(shown, ax=axes, shrink=0.8, ticks=[1, 2, 3])
     bar.ax.set_yticklabels(["10", "100", "1,000"])

@@ -166,10 +166,18 @@ def largest_features(path: Path, image_id: int, most: int) -> np.ndarray:
     return rows[np.argsort(-size, kind="stable")[:most]]
 
 
-def verified_pairs(path: Path) -> list[tuple[int, int, int, int]]:
-    """Return (first image ID, second image ID, COLMAP's configuration, number of inliers) of the verified pairs."""
+def verified_pairs(path: Path, names: Iterable[str]) -> list[tuple[int, int, int, int]]:
+    """Return (first image ID, second image ID, COLMAP's configuration, number of inliers) of the verified pairs.
+
+    Args:
+        path: the database, which also keeps photos that are not used any more.
+        names: the photos whose pairs are wanted.
+    """
+    ids = image_ids(path)
+    wanted = {ids[name] for name in names if name in ids}
     with _reading(path) as database:
         rows = database.execute(
             "SELECT pair_id, config, rows FROM two_view_geometries WHERE rows >= ?", (FEWEST_INLIERS,)
         ).fetchall()
-    return [(*divmod(int(pair), _MOST_IMAGES), int(config), int(count)) for pair, config, count in rows]
+    pairs = [(*divmod(int(pair), _MOST_IMAGES), int(config), int(count)) for pair, config, count in rows]
+    return [pair for pair in pairs if wanted.issuperset(pair[:2])]

@@ -212,7 +212,7 @@ def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Itera
     ids = database.image_ids(path)
     features = database.feature_counts(path)
     partners: dict[int, int] = {}
-    for first, second, _, _ in database.verified_pairs(path):
+    for first, second, _, _ in database.verified_pairs(path, names):
         for number in (first, second):
             partners[number] = partners.get(number, 0) + 1
     found = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ def choose_pairs(
     in_order: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[tuple[str, str]] | None:
-    """Return the pairs of photos to match; None for all of them.
+    """Return the pairs of photos to match; None for all in the database.
 
     Args:
         path: the database with the features.
@@ -38,9 +39,10 @@ def choose_pairs(
     Returns:
         Pairs of names, the smaller first in the order of `names`.
     """
-    if len(names) <= ALL_UP_TO:
-        return None
     ids = database.image_ids(path)
+    if len(names) <= ALL_UP_TO:
+        # The database may have photos that are not used any more.
+        return None if ids.keys() <= set(names) else list(combinations([name for name in names if name in ids], 2))
     names = [name for name in names if name in ids]
     features = [_unit(database.largest_features(path, ids[name], FEATURES)) for name in names]
     alike = np.zeros((len(names), len(names)), np.int32)

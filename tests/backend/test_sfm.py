@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
+from itertools import combinations
 from pathlib import PureWindowsPath
 
 import numpy as np
@@ -18,9 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from backend.capture import load_capture
 from backend.cli import main as command_line
+from backend.commands.capture import photo_matches
 from backend.commands.capture import sfm as sfm_command
 from backend.sfm import agreement, check, database, pairs, stages, worker
+from backend.sfm.background import stands_still
 from backend.sfm.former_frame import Pose, similarity
+from backend.sfm.learned.photos import add_photos
 from backend.sfm.model import centers_of
 from backend.sfm.sources.photos import Photo
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
@@ -464,11 +468,35 @@ def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
     path = made / "sfm" / database.NAME
     names = sorted(database.image_ids(path))
     assert pairs.choose_pairs(path, names) is None, "all pairs of a small set"
+    chosen = pairs.choose_pairs(path, [*names[:3], "unreadable.png"])
+    assert sorted(chosen) == list(combinations(names[:3], 2)), "not of photos that are not used any more"
     monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
     monkeypatch.setattr(pairs, "NEIGHBORS", 1)
     chosen = [[int(name.split()[1].partition(".")[0]) for name in pair] for pair in pairs.choose_pairs(path, names)]
     assert len(chosen) < VIEWS and {number for pair in chosen for number in pair} == set(range(1, VIEWS + 1))
     assert all(abs(first - second) <= 2 for first, second in chosen), "neighbors of the ring"
+
+
+def test_photos_that_are_not_used_any_more_do_not_tell_whether_the_background_stands_still(tmp_path):
+    """Three photos of a turntable were replaced by two of a moving camera, whose pair is all that counts."""
+    names, path = ["1.png", "2.png", "3.png", "new 1.png", "new 2.png"], tmp_path / "d.db"
+    for name in names:
+        Image.new("RGB", (64, 48)).save(tmp_path / name)
+    add_photos(path, tmp_path, [names])
+    points = np.random.default_rng(0).uniform(8, 40, (30, 2)).astype(np.float32)
+    ids = database.image_ids(path)
+    with pycolmap.Database.open(path) as stored:
+        for name in names:
+            stored.write_keypoints(ids[name], points + (8 if name == "new 2.png" else 0))
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+        geometry.inlier_matches = np.tile(np.arange(30, dtype=np.uint32)[:, None], 2)
+        for pair in [*combinations(names[:3], 2), tuple(names[3:])]:
+            stored.write_two_view_geometry(*sorted(ids[name] for name in pair), geometry)
+    assert stands_still(path, names) and not stands_still(path, names[3:])
+    photo_matches._require_matches(path, names[3:], tmp_path)
+    with pytest.raises(InputError, match="No two photos"):
+        photo_matches._require_matches(path, names[2:4], tmp_path)
 
 
 @pytest.mark.usefixtures("no_dense_points")
@@ -489,7 +517,7 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     assert not any(" " in name for name in database.image_ids(path))
     assert run_command("sfm", photos, "--out", out).code == EXIT_DONE
     assert set(database.image_ids(path)) == posed_photos(out) == {f"photo {i}.png" for i in range(1, VIEWS + 1)}
-    assert len(database.verified_pairs(path)) >= VIEWS - 1
+    assert len(database.verified_pairs(path, posed_photos(out))) >= VIEWS - 1
 
 
 def test_photos_to_leave_out_are_found_by_the_names_that_they_had():

@@ -144,7 +144,7 @@ def test_pairs_are_matched_and_verified_once(photos, tmp_path, stand_in):
     lightglue.match_pairs(path, None, stand_in.match, worker.verification())
     assert len(stand_in.pairs) == database.count_pairs(path)
     ids = database.image_ids(path)
-    verified = {frozenset(pair[:2]) for pair in database.verified_pairs(path)}
+    verified = {frozenset(pair[:2]) for pair in database.verified_pairs(path, names)}
     assert {frozenset((ids[names[i]], ids[names[i + 1]])) for i in range(3)} <= verified
     assert not any(ids["plain.png"] in pair for pair in verified)
     with pycolmap.Database.open(path) as stored:
@@ -178,7 +178,7 @@ def test_verification_is_that_of_colmap(photos, tmp_path, stand_in):
     database.write_pairs(listed, [(a, b) for a in names for b in names if a < b])
     with database.listed_names(theirs):
         pycolmap.verify_matches(theirs, listed, worker.verification())
-    assert database.verified_pairs(ours) == database.verified_pairs(theirs) != []
+    assert database.verified_pairs(ours, names) == database.verified_pairs(theirs, names) != []
 
 
 def test_pairs_of_large_sets_are_chosen_by_signed_descriptors(photos, tmp_path, stand_in, monkeypatch):

@@ -114,7 +114,7 @@ def test_poses_follow_from_joined_matches(photos, tmp_path, stand_in):
     assert len(degrees) == len(names) and degrees.max() < 0.5 and places.max() < 0.005
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
     assert model.num_points3D() > 1000 and model.compute_mean_track_length() > 3.3
-    matches = [count for *_, count in database.verified_pairs(tmp_path / "d.db")]
+    matches = [count for *_, count in database.verified_pairs(tmp_path / "d.db", names)]
     assert len(matches) == stand_in.pairs and sum(matches) > 7000
 
 

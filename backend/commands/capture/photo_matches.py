@@ -67,12 +67,12 @@ def match_photos(wanted: Wanted, source: Path, on_objects: bool, reporter: Stopp
         path = _match_places(wanted, wanted.matcher, on_objects, reporter)
     else:
         path = _match_features(wanted, on_objects, reporter)
-    if not on_objects and stands_still(path):
+    if not on_objects and stands_still(path, wanted.names):
         if not (wanted.capture / MASKS).is_dir():
             raise InputError(model.still_background(source))
         reporter.warning("The background stands still while the objects turn: only features on objects are used.")
         return match_photos(wanted, source, True, reporter)
-    _require_matches(path, source)
+    _require_matches(path, wanted.names, source)
     return path
 
 
@@ -158,9 +158,9 @@ def _photos_of(wanted: Wanted, on_objects: bool) -> list[str]:
     return [str(wanted.capture / IMAGES), str(work / GROUPS), *masks]
 
 
-def _require_matches(path: Path, source: Path) -> None:
-    """Raise InputError if no photos match, or all that do were taken from one spot."""
-    pairs = database.verified_pairs(path)
+def _require_matches(path: Path, names: list[str], source: Path) -> None:
+    """Raise InputError if none of the photos match, or all that do were taken from one spot."""
+    pairs = database.verified_pairs(path, names)
     if not pairs:
         raise InputError(
             f"No two photos in {source} show the same: they are of different scenes, blurred, or without texture; take "
