@@ -28,10 +28,10 @@ Make a capture of photos or a video alone: compute by COLMAP where they were tak
 points of the scene. Photos are copied to CAPTURE/images, unless PHOTOS is that folder;
 HEIC becomes JPEG. Of a video, sharp frames are taken, evenly in how far the picture
 moves. The cameras are written to CAPTURE/sparse/0, and what was found to
-CAPTURE/sfm/sfm.json. Photos that do not fit are named with the reason. If PHOTOS has
-folders images/ and masks/, both are copied. Cameras that are fixed to each other, with
-a folder each and the same names for the photos of a moment, are recognized. After a
-stop, the same command goes on.
+CAPTURE/sfm/sfm.json. Photos that do not fit are named with the reason. If PHOTOS has a
+folder images/, the photos in it are taken; if it has masks/, that is copied, too.
+Cameras that are fixed to each other, with a folder each and the same names for the
+photos of a moment, are recognized. After a stop, the same command goes on.
 
 With --matcher, networks match the photos, for those that differ too much in light or
 place for SIFT. FOLDER is a checkpoint of the package transformers, config.json and

@@ -1,7 +1,9 @@
 """Frames of videos: choice by motion and sharpness, turned, interlaced, HDR and damaged videos, and poses of a walk."""
 
 import json
+import os
 import shutil
+import sys
 from fractions import Fraction
 
 import av
@@ -10,7 +12,7 @@ import pytest
 from PIL import Image, ImageCms, ImageFilter
 
 from backend.capture.files import read_mask
-from backend.sfm.sources import motion, photo_files, photos, video
+from backend.sfm.sources import masks, motion, photo_files, photos, video
 from backend.shared.color import hdr
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.shared.events import Reporter
@@ -358,15 +360,100 @@ def test_masks_that_changed_are_copied_again_unless_others_were_made_of_them(tmp
         return *(int(mask.max()) for mask in there), (capture / "labels.json").read_text()
 
     assert copied(1, "{}") == (1, 0, "{}")
-    databases = [capture / "sfm" / name for name in ("database.db", "objects.db", "objects.db-wal")]
-    for path in databases:
-        path.write_bytes(b"features")
-    photos.take_photos([folder], capture, None, reporter())
-    assert all(path.exists() for path in databases)
     assert copied(3, '{"3": "cup"}') == (3, 1, '{"3": "cup"}')
-    assert [path.exists() for path in databases] == [True, False, False], "features may be on the objects alone"
     (capture / "masks" / "masks.json").write_text("{}")
     assert copied(1, '{"1": "mug"}') == (3, 1, '{"3": "cup"}')
+
+
+def test_features_on_objects_are_those_of_the_present_masks(tmp_path):
+    """Also if masks were changed in the capture itself; other IDs of the same objects do not matter."""
+    for part in ("images", "masks", "sfm"):
+        (tmp_path / part).mkdir()
+    databases = [tmp_path / "sfm" / name for name in ("database.db", "objects.db", "objects.db-wal")]
+    names = ["a.jpg", "b.jpg"]
+    for name in names:
+        heic(tmp_path / "images" / name)
+
+    def kept(ids, wanted=names):
+        Image.fromarray(np.arange(160, dtype=np.uint8)[None].repeat(120, 0) // 80 * ids).save(
+            tmp_path / "masks" / "a.png"
+        )
+        for path in databases:
+            path.write_bytes(b"features")
+        masks.write_object_masks(tmp_path, wanted, tmp_path / "sfm" / "masks")
+        return [path.exists() for path in databases]
+
+    assert kept(1) == [True, True, True] == kept(1) == kept(7)
+    assert kept(0) == [True, False, False]
+    assert kept(0, ["b.jpg", "a.jpg"]) == [True, True, True]
+
+
+def test_masks_in_a_folder_beside_photos_are_no_photos(tmp_path):
+    """Masks of converted photos get the new name, and those that were removed are removed from the capture."""
+    folder, capture = tmp_path / "toy", tmp_path / "capture"
+    (folder / "masks").mkdir(parents=True)
+    for name in ("1.heic", "2.jpg", "3.jpg"):
+        heic(folder / name)
+        Image.new("L", (160, 120), int(name[0])).save(folder / "masks" / f"{name}.png")
+    (folder / "labels.json").write_text('{"1": "cup"}')
+    taken = photos.take_photos([folder], capture, None, reporter())
+    assert [photo.name for photo in taken.photos] == ["1.jpg", "2.jpg", "3.jpg"]
+    assert [read_mask(capture / "masks" / f"{number}.jpg.png").max() for number in (1, 2, 3)] == [1, 2, 3]
+    assert (capture / "labels.json").exists() and len(list((capture / "masks").iterdir())) == 3
+    for number, made in ((2, False), (3, True)):
+        (folder / "masks" / f"{number}.jpg.png").unlink()
+        if made:
+            (capture / "masks" / "masks.json").write_text("{}")
+        photos.take_photos([capture], capture, None, reporter())
+        photos.take_photos([folder], capture, None, reporter())
+        assert (capture / "masks" / f"{number}.jpg.png").exists() == made
+
+
+def test_results_in_the_folder_of_photos_are_no_photos(tmp_path):
+    folder = tmp_path / "trip"
+    for name in ("a.jpg", "day/b.jpg", "room/images/c.jpg", "room-splats/cache/d.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        heic(folder / name)
+    (folder / "room" / "sfm").mkdir()
+    (folder / "room" / "sfm" / "source.json").write_text("{}")
+    (folder / "room-splats" / "objectgs.json").write_text("{}")
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.jpg", "day/b.jpg"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_names_that_are_not_text_are_named(tmp_path):
+    folder = tmp_path / "trip"
+    folder.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name)
+    shutil.copy(folder / "a.jpg", folder / os.fsdecode(b"caf\xe9.jpg"))
+    shutil.copy(folder / "a.jpg", folder / os.fsdecode(b"caf\xe9.mp4"))
+    taken = photos.take_photos([folder], tmp_path / "capture", None, reporter())
+    assert [photo.name for photo in taken.photos] == ["a.jpg", "b.jpg"]
+    assert "caf?.jpg is a name that is not text" in taken.unreadable["caf?.jpg"]
+
+
+def test_data_of_the_second_page_of_a_tiff_do_not_matter(tmp_path):
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    exif.get_ifd(0x8769)[0x920A] = 4.25
+    pages = [Image.new("RGB", (64, 48)) for _ in range(2)]
+    pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:], exif=exif.tobytes())
+    camera = photo_files.camera_of(tmp_path / "a.tif", True)
+    assert "Maker" in camera and "4.25" in camera
+
+
+def test_jpeg_named_as_heic_stays_a_jpeg(tmp_path):
+    pixels = heic(tmp_path / "a.jpg", orientation=6)
+    (tmp_path / "a.jpg").rename(tmp_path / "a.heic")
+    assert photo_files.is_turned_by_right_angle(tmp_path / "a.heic")
+    kept = photo_files.copy_photo(tmp_path / "a.heic", tmp_path / "kept.heic", False)
+    assert kept.name == "kept.jpg" and kept.read_bytes() == (tmp_path / "a.heic").read_bytes()
+    made = photo_files.copy_photo(tmp_path / "a.heic", tmp_path / "made.heic", True)
+    with Image.open(made) as image:
+        assert np.abs(np.asarray(image, float) - np.rot90(pixels, -1)).mean() < 4
+    assert photo_files.camera_of(tmp_path / "a.heic", True) == photo_files.camera_of(made, True)
 
 
 def test_videos_of_one_name_have_folders_of_their_own(tmp_path):
@@ -519,13 +606,13 @@ def test_masks_for_features_have_the_size_of_the_photos(tmp_path):
     ids = np.zeros((60, 80), np.uint8)
     ids[:, 40:] = 7
     Image.fromarray(ids).save(tmp_path / "masks" / "a.png")
-    photos.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+    masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
     half, whole = (np.asarray(Image.open(tmp_path / "features" / f"{name}.jpg.png")) for name in "ab")
     assert half.shape == whole.shape == (120, 160) and (whole == 255).all()
     assert (half[:, :80] == 0).all() and (half[:, 80:] == 255).all()
     Image.fromarray(ids.T).save(tmp_path / "masks" / "a.png")
     with pytest.raises(InputError, match=r"60x80 pixels, but the photo a\.jpg is 160x120"):
-        photos.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+        masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
 
 
 def test_pixels_of_videos_are_made_square(tmp_path):

@@ -14,7 +14,8 @@ from ...sfm.background import stands_still
 from ...sfm.learned import positions
 from ...sfm.learned.checkpoint import LOFTR, fingerprint, kind_of
 from ...sfm.pairs import ALL_UP_TO, choose_pairs
-from ...sfm.sources.photos import IMAGES, MASKS, write_object_masks
+from ...sfm.sources.masks import write_object_masks
+from ...sfm.sources.stamps import IMAGES, MASKS
 from ...sfm.stages import run_stage
 from ...shared.errors import InputError
 from ...shared.formats.photos_source import WORK

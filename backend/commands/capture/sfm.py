@@ -25,11 +25,13 @@ from ...sfm.location import common_up, meters_per_unit, positions_in_meters, ups
 from ...sfm.pairs import ALL_UP_TO, NEIGHBORS
 from ...sfm.rig import rigs_of
 from ...sfm.sources.calibration import photos_by_camera, read_calibration
-from ...sfm.sources.photos import IMAGES, Photo, are_copied, take_photos
+from ...sfm.sources.photos import Photo, are_copied, take_photos
+from ...sfm.sources.stamps import IMAGES
 from ...sfm.stages import run_stage
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import make_folder, recorded
+from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.photos_source import (
     PHOTOS,
@@ -105,6 +107,8 @@ def _require_sources(sources: list[Path]) -> None:
     if not all(path.exists() for path in sources):
         raise InputError(f"{_missing(sources)} does not exist; choose a folder of photos, or a video.")
     for path in sources:
+        if legible(str(path)) != str(path):
+            raise InputError(f"{legible(str(path))} is a name that is not text in UTF-8; rename it.")
         if path.is_dir() and len(sources) > 1:
             raise InputError(f"{path} is a folder beside other photos; choose one folder, or files.")
         if path.is_file() and path.suffix.lower() not in PHOTOS | VIDEOS:

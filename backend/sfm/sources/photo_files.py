@@ -25,8 +25,9 @@ from ...shared.formats.photos_source import RAW
 COPIED = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 """Suffixes of files that COLMAP reads. HEIC becomes JPEG with its EXIF data, which may tell the focal length; other
 formats become PNG."""
-_COPIED_FORMATS, _HEIC_FORMATS = {"JPEG", "MPO", "PNG", "TIFF", "BMP"}, {"HEIF", "AVIF"}
-"""Pillow's names of their formats, and of those of HEIC."""
+_JPEG_FORMATS, _HEIC_FORMATS = {"JPEG", "MPO"}, {"HEIF", "AVIF"}
+_COPIED_FORMATS = _JPEG_FORMATS | {"PNG", "TIFF", "BMP"}
+"""Pillow's names of the formats of JPEG, of HEIC, and of all that COLMAP reads."""
 _MAKER = (ExifTags.Base.Make, ExifTags.Base.Model)
 _ZOOM = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
 """EXIF entries of the lens; a digital zoom keeps the size and the focal length."""
@@ -56,13 +57,15 @@ def camera_of(path: Path, turned: bool) -> str:
             warnings.simplefilter("ignore")
             with PilImage.open(path) as image:
                 size, exif = image.size, image.getexif()
+                # Before the pixels, after which the file may be closed.
+                lens = _lens_of(exif)
                 image.draft("L", (64, 64))  # Decodes a JPEG at an eighth of its size.
                 image.load()
     except Exception as error:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged or its format is unknown.") from error
     if turned and _orientation(exif) > 4:
         size = size[::-1]
-    return f"{size[0]}x{size[1]} {_lens_of(exif)}"
+    return f"{size[0]}x{size[1]} {lens}"
 
 
 def _lens_data(path: Path) -> PilImage.Exif:
@@ -123,18 +126,17 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
     Raises:
         InputError: it cannot be read.
     """
-    suffix = path.suffix.lower()
     target = path_of_copy(path, target)
     if target.exists() and not again:
         return target
     make_folder(target.parent)
-    if suffix in RAW:
+    if path.suffix.lower() in RAW:
         write_image(target, _developed(path), _lens_data(path))
     elif _is_heic(path):
         write_atomic(target, _as_jpeg(path, lambda image: image))
-    elif not is_read_by_colmap(path):
+    elif not is_read_by_colmap(path) and not _is_jpeg(path):
         write_image(target, read_image(path))
-    elif turn and suffix in (".jpg", ".jpeg") and _is_turned(path):
+    elif turn and _is_jpeg(path) and _is_turned(path):
         write_atomic(target, _as_jpeg(path, ImageOps.exif_transpose))
     else:
         with atomic_path(target) as part:
@@ -144,7 +146,14 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
 
 def path_of_copy(path: Path, target: Path) -> Path:
     """Return the path that the copy of a photo has, given the one that it would have if it is not converted."""
-    return target if is_read_by_colmap(path) else target.with_suffix(".jpg" if _is_heic(path) else ".png")
+    if is_read_by_colmap(path):
+        return target
+    return target.with_suffix(".jpg" if _is_heic(path) or _is_jpeg(path) else ".png")
+
+
+def _is_jpeg(path: Path) -> bool:
+    """Return whether a photo is a JPEG by what is in it, as some programs name also those .heic."""
+    return path.suffix.lower() not in RAW and _format_of(path) in _JPEG_FORMATS
 
 
 def _is_heic(path: Path) -> bool:
@@ -186,7 +195,7 @@ def _orientation(exif: PilImage.Exif) -> int:
 
 def is_turned_by_right_angle(path: Path) -> bool:
     """Return whether a JPEG is to be shown with its width as height, by its EXIF orientation."""
-    if path.suffix.lower() not in (".jpg", ".jpeg"):
+    if not _is_jpeg(path):
         return False
     try:
         with PilImage.open(path) as image:
@@ -197,7 +206,7 @@ def is_turned_by_right_angle(path: Path) -> bool:
 
 def projection_of(path: Path) -> str | None:
     """Return what a photo is instead of a picture by one lens, by its XMP and EXIF data; None for all others."""
-    if path.suffix.lower() not in (".jpg", ".jpeg"):
+    if not _is_jpeg(path):
         return None
     with suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -3,66 +3,33 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-from PIL import Image
-
-from ...capture.files import (
-    LOSSY_SUFFIXES,
-    Files,
-    encode_mask,
-    image_size,
-    mask_names,
-    mask_size,
-    read_mask,
-    same_shape,
-    write_image,
-)
-from ...capture.made_masks import is_made
-from ...capture.mask_sources import MaskFiles, ids_of
+from ...capture.files import Files, image_size, mask_names, mask_size, same_shape
+from ...capture.mask_sources import MaskFiles
 from ...shared.errors import InputError
-from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
+from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, VIDEOS, WORK, natural_order
+from ...shared.formats.photos_source import PHOTOS, SOURCE, VIDEOS, WORK, natural_order
+from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StoppingReporter
 from .. import database
 from . import photo_files, video
+from .masks import copy_rest, remove_gone, write_masks
+from .stamps import FILES, IMAGES, MASKS, Stamps
 
-IMAGES, MASKS = "images", "masks"
-FRAMES, _FILES = "frames.json", "photos.json"
-"""Files in sfm/ with the frames that were taken of each video, and with the size and time of each photo's file."""
-_OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
+FRAMES = "frames.json"
+"""File in sfm/ with the frames that were taken of each video."""
 _READS_ALL_NAMES = os.name != "nt"
 _NOT_OF_USERS = (".", "@eaDir", "#recycle")
 """How names of files and folders begin that computers put beside photos, such as thumbnails."""
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
-
-
-class _Stamps:
-    """Size and time of the files that those of a capture were made of, kept in its sfm/."""
-
-    def __init__(self, capture: Path) -> None:
-        self._path = capture / WORK / _FILES
-        self._known: dict[str, list[Any]] = read_json(self._path) if self._path.exists() else {}
-        self._now: dict[str, list[Any]] = {}
-
-    def has_changed(self, name: str, path: Path, *details: Any) -> bool:
-        """Return whether a file, or what else a copy of it depends on, is another than when it was last asked for."""
-        status = path.stat()
-        self._now[name] = [status.st_size, status.st_mtime_ns, *details]
-        return name in self._known and self._known[name] != self._now[name]
-
-    def write(self) -> None:
-        make_folder(self._path.parent)
-        write_json(self._path, {**self._known, **self._now})
 
 
 class Photo(NamedTuple):
@@ -103,7 +70,7 @@ def take_photos(
     """Copy photos and frames of videos to the images/ of a capture, unless they are there.
 
     Args:
-        sources: a folder with photos and videos, also in subfolders, or with a folder images/ and, optionally, masks/
+        sources: a folder with photos and videos, also in subfolders or in its folder images/, and, optionally, masks/
             and files with names, which are copied, too, again if they have changed; or files of photos and videos.
             Photos named like another one with `_mask` are its masks. Masks that are JPEGs in black and white are
             written as PNG. If they are gone, the copies that the capture has are used.
@@ -121,7 +88,7 @@ def take_photos(
     source = sources[0]
     if source.is_dir():
         base = source / IMAGES if (source / IMAGES).is_dir() else source
-        found = _listed(base, capture)
+        found = _listed(base, source / MASKS, capture)
     else:
         given = [path.absolute() for path in sources]
         found = _without_doubles(given)
@@ -132,6 +99,7 @@ def take_photos(
             base = Path(os.path.commonpath([path.parent for path in found]))
         except ValueError as error:
             raise InputError(f"{found[0]} and {found[-1]} are on two disks; copy the photos to one folder.") from error
+    found, unreadable = _with_legible_names(found, base)
     found, are_beside = _without_masks(found)
     is_alone = len(found) == 1 and not source.is_dir()
     in_place = base.resolve() == (capture / IMAGES).resolve()
@@ -152,10 +120,10 @@ def take_photos(
     else:
         turn = True
     turn = turn and not in_place
-    photos, unreadable = [], {}
+    photos = []
     names: dict[str, str] = {}
     taken_names: set[str] = set()
-    stamps = _Stamps(capture)
+    stamps = Stamps(capture)
     for number, path in enumerate(files):
         reporter.progress(number, len(files))
         relative = path.relative_to(base)
@@ -206,21 +174,23 @@ def take_photos(
     if len(photos) < 2:
         why = next(iter(unreadable.values()), "a single photo has no pose.")
         raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
-    if base != source and source.is_dir():
-        if not in_place:
-            _copy_rest(source, capture, stamps)
+    if source.is_dir() and (base != source or (source / MASKS).is_dir()):
         masks = MaskFiles(source / MASKS, names, base)
-        _write_masks(masks, masks.lossy, names, capture, stamps)
+        if not in_place:
+            copy_rest(source, masks, names, capture, stamps)
+        write_masks(masks, masks.lossy, names, capture, stamps)
     if are_beside:
         masks = MaskFiles(base, names, base)
-        _write_masks(masks, masks.photos, names, capture, stamps)
+        write_masks(masks, masks.photos, names, capture, stamps)
+    if has_masks and not in_place:
+        remove_gone(capture, stamps)
     stamps.write()
     return Taken(photos, unreadable, not files)
 
 
 def are_copied(sources: Sequence[Path], capture: Path) -> bool:
     """Return whether photos or videos are gone whose copies or frames an earlier run has put into a capture."""
-    return (capture / WORK / _FILES).is_file() and not all(path.exists() for path in sources)
+    return (capture / WORK / FILES).is_file() and not all(path.exists() for path in sources)
 
 
 def _stem_in(base: Path, path: Path) -> str:
@@ -273,28 +243,6 @@ def _lens_size(lenses: Collection[tuple[int, int]], size: tuple[int, int]) -> tu
     return next((each for each in (size, size[::-1]) if each in lenses), None)
 
 
-def _write_masks(
-    masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: _Stamps
-) -> None:
-    """Write the masks of photos to the masks/ of a capture; names: of the photos there."""
-    for photo in photos:
-        suffix, data = encode_mask(ids_of(masks.read(photo)))
-        target = capture / MASKS / (names[photo] + suffix)
-        if _is_missing(target, masks.files[photo], capture, stamps):
-            database.remove_on_objects(capture / WORK)
-            make_folder(target.parent)
-            write_atomic(target, data)
-
-
-def _is_missing(target: Path, path: Path, capture: Path, stamps: _Stamps) -> bool:
-    """Return whether a mask or list of names is not in the capture, or is one of an earlier state of the given file.
-
-    Masks that were made there of others are not replaced.
-    """
-    has_changed = stamps.has_changed((Path("..") / target.relative_to(capture)).as_posix(), path)
-    return not target.exists() or (has_changed and not is_made(capture / MASKS))
-
-
 def _frames_of(path: Path, capture: Path, folder: str, count: int | None, reporter: StoppingReporter) -> list[str]:
     """Take the frames of a video, unless that was done, and return their names in a folder of images/."""
     listed = capture / WORK / FRAMES
@@ -321,20 +269,41 @@ def _frames_of(path: Path, capture: Path, folder: str, count: int | None, report
     return names
 
 
-def _listed(base: Path, capture: Path) -> list[Path]:
-    """Return the photos and videos below a folder, as from `_without_doubles`, but for those of the capture in it."""
+def _listed(base: Path, masks: Path, capture: Path) -> list[Path]:
+    """Return the photos and videos below a folder, as from `_without_doubles`, but for those in results.
+
+    Args:
+        base: the folder.
+        masks: folder of their masks, which may be in it.
+        capture: the capture, which may be in it, as may be earlier ones and reconstructions.
+    """
     try:
         inside = capture.resolve()
+        paths = list(base.rglob("*"))
+        made = {path.parent for path in paths if path.name == Reconstruction(base).settings.name}
+        made |= {path.parents[1] for path in paths if path.parts[-2:] == (WORK, SOURCE)}
+        left_out = {masks, *(folder for folder in made if base in folder.parents)}
         return _without_doubles(
             path
-            for path in base.rglob("*")
+            for path in paths
             if path.suffix.lower() in PHOTOS | VIDEOS
             and not any(part.startswith(_NOT_OF_USERS) for part in path.relative_to(base).parts)
             and path.is_file()
+            and left_out.isdisjoint(path.parents)
             and (base.resolve().is_relative_to(inside) or not path.resolve().is_relative_to(inside))
         )
     except OSError as error:
         raise InputError(f"{error.filename or base} cannot be read ({error.strerror}); check it.") from error
+
+
+def _with_legible_names(paths: Sequence[Path], base: Path) -> tuple[list[Path], dict[str, str]]:
+    """Return the files whose names are text, and why others cannot be read, which Linux allows."""
+    names = {path: path.relative_to(base).as_posix() for path in paths}
+    return [path for path in paths if legible(names[path]) == names[path]], {
+        shown: f"{shown} is a name that is not text in UTF-8; rename it."
+        for name in names.values()
+        if (shown := legible(name)) != name
+    }
 
 
 def _without_doubles(found: Iterable[Path]) -> list[Path]:
@@ -376,49 +345,3 @@ def _require_space(paths: Sequence[Path], capture: Path) -> None:
             f"The photos need {needed / 1e9:.1f} GB and the disk of {existing} has {free / 1e9:.1f} GB free; make "
             "room, or choose another --out."
         )
-
-
-def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> None:
-    """Write for each photo of a capture where features may be: on objects, or everywhere without a mask.
-
-    Args:
-        capture: the capture, with masks/.
-        names: the photos.
-        folder: receives NAME.png, black where there is no object.
-
-    Raises:
-        InputError: No photo has a mask, or one cannot be read.
-    """
-    masks = Files(capture / MASKS)
-    found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
-    if not found:
-        raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
-    shutil.rmtree(folder, ignore_errors=True)
-    for name in names:
-        size = image_size(capture / IMAGES / name)
-        ids = read_mask(found[name]) if name in found else np.ones((1, 1), np.uint8)
-        if name in found and not same_shape(ids.shape[::-1], size):
-            raise InputError(
-                f"{found[name]} is {ids.shape[1]}x{ids.shape[0]} pixels, but the photo {name} is {size[0]}x{size[1]}; "
-                "make the mask the photo's size."
-            )
-        target = folder / f"{name}.png"
-        make_folder(target.parent)
-        # COLMAP looks features up in it by the pixels of the photo.
-        shown = Image.fromarray((ids > 0).astype(np.uint8) * 255)
-        write_image(target, shown if shown.size == size else shown.resize(size, Image.Resampling.NEAREST))
-
-
-def _copy_rest(source: Path, capture: Path, stamps: _Stamps) -> None:
-    """Copy masks that are not JPEGs, and files with names, that are beside the photos."""
-    masks = source / MASKS
-    others = [path for path in source.iterdir() if path.is_file() and _OTHER_FILES.fullmatch(path.name)]
-    for path in [*others, *(path for path in (masks.rglob("*") if masks.is_dir() else ()) if path.is_file())]:
-        if path.suffix.lower() in LOSSY_SUFFIXES:
-            continue
-        target = capture / path.relative_to(source)
-        if _is_missing(target, path, capture, stamps):
-            database.remove_on_objects(capture / WORK)
-            make_folder(target.parent)
-            with atomic_path(target) as part:
-                shutil.copyfile(path, part)

@@ -33,6 +33,11 @@ def file_stem(name: str, fallback: str = "object") -> str:
     return f"{stem}-file" if _RESERVED.match(stem) else stem
 
 
+def legible(name: str) -> str:
+    """Return a name as text; bytes that are not UTF-8, which Linux allows in names, become question marks."""
+    return name.encode(errors="replace").decode()
+
+
 def distinct_stems(names: Mapping[Key, str], fallback: str = "object") -> dict[Key, str]:
     """Return stems that differ in more than upper and lower case.
 

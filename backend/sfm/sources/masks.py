@@ -1,0 +1,120 @@
+"""Masks and names beside photos: their copies in a capture, and the masks for a search of features on objects."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, same_shape
+from ...capture.made_masks import is_made
+from ...capture.mask_sources import MaskFiles, ids_of
+from ...shared.errors import InputError
+from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
+from ...shared.formats.file_names import legible
+from ...shared.formats.photos_source import WORK
+from .. import database
+from .stamps import IMAGES, MASKS, Stamps
+
+_OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
+
+
+def write_masks(
+    masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: Stamps
+) -> None:
+    """Write the masks of photos to the masks/ of a capture; names: of the photos there."""
+    for photo in photos:
+        suffix, data = encode_mask(ids_of(masks.read(photo)))
+        target = capture / MASKS / (names[photo] + suffix)
+        if _is_missing(target, masks.files[photo], capture, stamps):
+            make_folder(target.parent)
+            write_atomic(target, data)
+
+
+def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture: Path, stamps: Stamps) -> None:
+    """Copy masks that are not JPEGs, and files with names, that are beside the photos.
+
+    Args:
+        source: the folder with them.
+        masks: the masks in its masks/.
+        names: of the photos there, in the capture; masks by whose names they are not found get new names.
+        capture: the capture.
+        stamps: of the copies.
+    """
+    folder = source / MASKS
+    renamed = {
+        masks.files[photo]: Path(MASKS) / (names[photo] + masks.files[photo].suffix)
+        for photo in masks.photos
+        if masks.files[photo].relative_to(folder).as_posix() not in mask_names(names[photo])[0]
+        and names[photo] != photo
+    }
+    others = [path for path in source.iterdir() if path.is_file() and _OTHER_FILES.fullmatch(path.name)]
+    for path in [*others, *(path for path in (folder.rglob("*") if folder.is_dir() else ()) if path.is_file())]:
+        if path.suffix.lower() in LOSSY_SUFFIXES or legible(str(path)) != str(path):
+            continue
+        target = capture / renamed.get(path, path.relative_to(source))
+        if _is_missing(target, path, capture, stamps):
+            make_folder(target.parent)
+            with atomic_path(target) as part:
+                shutil.copyfile(path, part)
+
+
+def remove_gone(capture: Path, stamps: Stamps) -> None:
+    """Remove the copies of masks that were removed beside the photos, unless others were made of them."""
+    if not is_made(capture / MASKS):
+        for name in stamps.forget_masks():
+            (capture / name).unlink(missing_ok=True)
+
+
+def _is_missing(target: Path, path: Path, capture: Path, stamps: Stamps) -> bool:
+    """Return whether a mask or list of names is not in the capture, or is one of an earlier state of the given file.
+
+    Masks that were made there of others are not replaced.
+    """
+    has_changed = stamps.has_changed((Path("..") / target.relative_to(capture)).as_posix(), path)
+    return not target.exists() or (has_changed and not is_made(capture / MASKS))
+
+
+def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> None:
+    """Write for each photo of a capture where features may be: on objects, or everywhere without a mask.
+
+    If a mask is another than before, the features on objects are forgotten.
+
+    Args:
+        capture: the capture, with masks/.
+        names: the photos.
+        folder: receives NAME.png, black where there is no object.
+
+    Raises:
+        InputError: No photo has a mask, or one cannot be read.
+    """
+    masks = Files(capture / MASKS)
+    found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
+    if not found:
+        raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
+    for name in names:
+        size = image_size(capture / IMAGES / name)
+        ids = read_mask(found[name]) if name in found else np.ones((1, 1), np.uint8)
+        if name in found and not same_shape(ids.shape[::-1], size):
+            raise InputError(
+                f"{found[name]} is {ids.shape[1]}x{ids.shape[0]} pixels, but the photo {name} is {size[0]}x{size[1]}; "
+                "make the mask the photo's size."
+            )
+        # COLMAP looks features up in it by the pixels of the photo.
+        shown = Image.fromarray((ids > 0).astype(np.uint8) * 255)
+        buffer = io.BytesIO()
+        (shown if shown.size == size else shown.resize(size, Image.Resampling.NEAREST)).save(
+            buffer, "PNG", compress_level=1
+        )
+        target = folder / f"{name}.png"
+        if target.exists():
+            if target.read_bytes() == buffer.getvalue():
+                continue
+            database.remove_on_objects(capture / WORK)
+        make_folder(target.parent)
+        write_atomic(target, buffer.getvalue())

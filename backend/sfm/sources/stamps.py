@@ -1,0 +1,42 @@
+"""Which files a capture's photos, masks and names are copies of, to copy those again that have changed."""
+
+from __future__ import annotations
+
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ...shared.formats.atomic import make_folder
+from ...shared.formats.json_file import read_json, write_json
+from ...shared.formats.photos_source import WORK
+
+IMAGES, MASKS = "images", "masks"
+"""Folders of a capture."""
+FILES = "photos.json"
+"""File in sfm/ with the size and time of each file."""
+
+
+class Stamps:
+    """Size and time of the files that those of a capture were made of, kept in its sfm/."""
+
+    def __init__(self, capture: Path) -> None:
+        self._path = capture / WORK / FILES
+        self._known: dict[str, list[Any]] = read_json(self._path) if self._path.exists() else {}
+        self._now: dict[str, list[Any]] = {}
+
+    def has_changed(self, name: str, path: Path, *details: Any) -> bool:
+        """Return whether a file, or what else a copy of it depends on, is another than when it was last asked for."""
+        status = path.stat()
+        self._now[name] = [status.st_size, status.st_mtime_ns, *details]
+        return name in self._known and self._known[name] != self._now[name]
+
+    def forget_masks(self) -> list[str]:
+        """Forget the masks that were not asked for, as they are gone, and return their paths in the capture."""
+        gone = [name for name in self._known.keys() - self._now.keys() if name.startswith(f"../{MASKS}/")]
+        for name in gone:
+            del self._known[name]
+        return [name.removeprefix("../") for name in gone if PurePosixPath(name).parts.count("..") == 1]
+
+    def write(self) -> None:
+        """Write the file, with what was asked for now or earlier."""
+        make_folder(self._path.parent)
+        write_json(self._path, {**self._known, **self._now})
