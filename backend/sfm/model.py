@@ -12,8 +12,8 @@ import numpy as np
 import pycolmap
 
 from ..shared.errors import InputError
-from ..shared.formats.atomic import replace_file
-from ..shared.formats.photos_source import WORK
+from ..shared.formats.atomic import replace_file, write_atomic
+from ..shared.formats.photos_source import SOURCE, WORK
 from . import database
 from .agreement import Agreement, measure_agreement
 
@@ -180,12 +180,14 @@ def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
 
 @contextmanager
 def former_on_error(capture: Path) -> Iterator[None]:
-    """Put the present sparse/0 of a capture back, or remove a new one, if the body raises an exception."""
+    """Put the present sparse/0 and sfm/source.json of a capture back, or remove a new model, on any exception."""
     # Not beside the model, where it would be another one of the capture.
     target, former = capture / SPARSE, capture / WORK / "former"
     shutil.rmtree(former, ignore_errors=True)
     if target.exists():
         shutil.copytree(target, former)
+    source = capture / WORK / SOURCE
+    made_from = source.read_bytes() if source.exists() else None
     try:
         yield
     except BaseException:
@@ -196,6 +198,8 @@ def former_on_error(capture: Path) -> Iterator[None]:
         if former.exists():
             replace_file(former, target)
         shutil.rmtree(old, ignore_errors=True)
+        if made_from is not None:
+            write_atomic(source, made_from)
         raise
     shutil.rmtree(former, ignore_errors=True)
 

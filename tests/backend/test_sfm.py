@@ -167,8 +167,10 @@ def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypa
     capture = shutil.copytree(made, tmp_path / "capture")
     before = (capture / "sparse" / "0" / "images.bin").read_bytes()
     monkeypatch.setattr(stages, "_KILLED", (0,))
-    result = run_command("sfm", photos, "--out", capture)
+    source = photos_source.read_source(capture)
+    result = run_command("sfm", photos, "--out", capture, "--set", "2", "--features", "objects")
     assert result.code == EXIT_BAD_INPUT and "The system ended the stage extract" in result.err
+    assert photos_source.read_source(capture) == source, "that of the model"
     assert (capture / "sparse" / "0" / "images.bin").read_bytes() == before
 
 
@@ -180,12 +182,16 @@ def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkey
     before = {path: path.read_bytes() for path in (out / "sparse").rglob("*") if path.is_file()}
     report = (out / "sfm" / "sfm.json").read_bytes()
 
+    def left_out() -> list[str]:
+        return photos_source.read_source(out).leave_out
+
     def stopped(found, *_):
-        assert (out / "sparse" / "0").is_dir()
+        assert (out / "sparse" / "0").is_dir() and left_out() == ["photo 7.png"]
         raise Cancelled("Stopped")
 
     monkeypatch.setattr(sfm_command, "_densify", stopped)
-    assert run_command("sfm", photos, "--out", out).code == EXIT_CANCELLED
+    assert run_command("sfm", photos, "--out", out, "--leave-out", "photo 7.png").code == EXIT_CANCELLED
+    assert left_out() == (["photo 7.png"] if is_first else [])
     assert {path: path.read_bytes() for path in (out / "sparse").rglob("*") if path.is_file()} == before
     assert (out / "sfm" / "sfm.json").read_bytes() == report
 

@@ -615,6 +615,26 @@ def test_masks_for_features_have_the_size_of_the_photos(tmp_path):
         masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
 
 
+def test_what_would_be_refused_at_the_end_is_refused_before_the_search_on_objects(tmp_path):
+    for part in ("images", "masks"):
+        (tmp_path / part).mkdir()
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    for name in names:
+        heic(tmp_path / "images" / name)
+    Image.new("L", (160, 120), 1).save(tmp_path / "masks" / "a.png")
+    with pytest.raises(InputError, match=r"b\.png is missing, as are those of 2 of 3 photos"):
+        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+    shutil.copy(tmp_path / "masks" / "a.png", tmp_path / "masks" / "b.png")
+    masks.write_object_masks(tmp_path, names, tmp_path / "features")
+    (tmp_path / "test.txt").write_text("a.jpg\nb.heic\n")
+    with pytest.raises(InputError, match=r"test\.txt names b\.heic, which is no photo"):
+        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+    (tmp_path / "test.txt").unlink()
+    (tmp_path / "labels.json").write_text("one name a line")
+    with pytest.raises(InputError, match=r"labels\.json is not a list of labels"):
+        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+
+
 def test_pixels_of_videos_are_made_square(tmp_path):
     write_video(tmp_path / "a.mp4", pan(12), sample_aspect_ratio=Fraction(4, 3))
     names = video.write_frames(tmp_path / "a.mp4", tmp_path / "frames", 3, reporter())

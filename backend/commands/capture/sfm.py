@@ -88,7 +88,9 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                     options.calibration,
                     options.matcher,
                 )  # fmt: skip
-                write_source(capture, made_from)
+                # Until there is a new model, the file says what the present one was computed from.
+                if before is None or not (capture / model.SPARSE).exists():
+                    write_source(capture, made_from)
                 _run(made_from, capture, reporter)
         except InputError:
             if not any((capture / WORK).glob("*.db")):
@@ -181,8 +183,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     write_json(listed_names, names)
     wanted = Wanted(capture, names, in_order, made_from.matcher)
     path = match_photos(wanted, source, made_from.features == "objects", reporter)
-    if path.name.endswith(database.ON_OBJECTS):
-        write_source(capture, replace(made_from, features="objects"))
+    on_objects = path.name.endswith(database.ON_OBJECTS)
 
     candidates: list[model.Candidate] = []
     has_failed = False
@@ -219,7 +220,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     up = common_up(model.rotations_of(best.model), ups_in_cameras(images, figures))
     with model.former_on_error(capture):
         model.write_model(best.model, capture)
-        on_objects = path.name.endswith(database.ON_OBJECTS)
+        write_source(capture, replace(made_from, features="objects" if on_objects else "auto"))
         weak |= _densify(best.model, capture, on_objects, reporter)
         check.write_picture(work / PICTURE, best.model, figures, path, list(weak))
         posed = list(figures)

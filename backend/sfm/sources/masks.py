@@ -14,6 +14,7 @@ from PIL import Image
 from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, same_shape
 from ...capture.made_masks import is_made
 from ...capture.mask_sources import MaskFiles, ids_of
+from ...capture.names import HELD_OUT, read_held_out, read_names
 from ...shared.errors import InputError
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.file_names import legible
@@ -91,12 +92,13 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
         folder: receives NAME.png, black where there is no object.
 
     Raises:
-        InputError: No photo has a mask, or one cannot be read.
+        InputError: No photo has a mask, one cannot be read, or the finished capture could not be.
     """
     masks = Files(capture / MASKS)
     found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
     if not found:
         raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
+    _require_readable(capture, names, [name for name in names if name not in found])
     for name in names:
         size = image_size(capture / IMAGES / name)
         ids = read_mask(found[name]) if name in found else np.ones((1, 1), np.uint8)
@@ -118,3 +120,19 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
             database.remove_on_objects(capture / WORK)
         make_folder(target.parent)
         write_atomic(target, buffer.getvalue())
+
+
+def _require_readable(capture: Path, names: Sequence[str], unmasked: Sequence[str]) -> None:
+    """Raise InputError for what would only be refused after hours, when the finished capture is read."""
+    if 2 * len(unmasked) > len(names) and not is_made(capture / MASKS):
+        first = capture / MASKS / Path(unmasked[0]).with_suffix(".png")
+        raise InputError(
+            f"The mask {first} is missing, as are those of {len(unmasked)} of {len(names)} photos; add them."
+        )
+    read_names(capture)
+    unknown = [name for name in read_held_out(capture) or () if name not in names]
+    if unknown:
+        raise InputError(
+            f"{capture / HELD_OUT} names {unknown[0][:200]}, which is no photo in {capture / IMAGES}; correct the name "
+            "or remove its line."
+        )
