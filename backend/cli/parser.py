@@ -113,6 +113,10 @@ def _add_capture_commands(commands: _Commands) -> None:
         "--leave-out", nargs="+", default=[], metavar="NAME", help="photos to leave out, named as in images/"
     )
     poses.add_argument(
+        "--list", type=Path, metavar="FILE",
+        help='JSON file with more of both, if a command line is too short: {"photos": [...], "leave_out": [...]}',
+    )  # fmt: skip
+    poses.add_argument(
         "--set", type=types.count, default=1, metavar="N",
         help="which set of photos to use if nothing connects several: 1, the largest; 2, the next (1)",
     )  # fmt: skip

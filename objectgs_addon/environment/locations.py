@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.formats.file_names import file_stem
+from ...backend.shared.formats.json_file import write_json
 from ...backend.shared.formats.photos_source import PhotosSource, read_source
 from ...backend.shared.formats.regular_file import is_file
 from ..process.backend_process import backend_command, backend_environment
@@ -19,6 +21,11 @@ from ..process.jobs import Job
 from . import environment, online_access
 from .extension import PACKAGE, ROOT
 from .worker.layout import VERSIONS
+
+
+_LONGEST_NAMES = 8000
+"""Number of characters of photos' names from which on they are given in a file; Windows has a command line of 32,767 for
+all, and a space and two quotes for each name."""
 
 
 def preferences() -> Any:
@@ -168,12 +175,18 @@ def naming_options(names: str) -> list[str]:
 
 def sfm_job(capture: Path, source: PhotosSource) -> Job:
     """Return a job that computes the poses of photos, and writes a capture."""
+    photos, leave_out, listed = source.photos, source.leave_out, []
+    if sum(len(str(each)) for each in (*photos, *leave_out)) > _LONGEST_NAMES:
+        # In the folder of this session, since the job may wait.
+        folder = Path(tempfile.mkdtemp(prefix="objectgs-", dir=bpy.app.tempdir))
+        write_json(folder / "photos.json", {"photos": [str(path) for path in photos[1:]], "leave_out": leave_out})
+        photos, leave_out, listed = photos[:1], [], ["--list", str(folder / "photos.json")]
     return backend_job(
         f"Photos of {name_of_photos(source.photos)}",
         "sfm",
         capture,
         "sfm",
-        *map(str, source.photos),
+        *map(str, photos),
         "--out",
         str(capture),
         "--cameras",
@@ -184,7 +197,8 @@ def sfm_job(capture: Path, source: PhotosSource) -> Job:
         *(["--set", str(source.set)] if source.set > 1 else []),
         *(["--calibration", str(source.calibration)] if source.calibration else []),
         *(["--matcher", str(source.matcher)] if source.matcher else []),
-        *(["--leave-out", *source.leave_out] if source.leave_out else []),
+        *(["--leave-out", *leave_out] if leave_out else []),
+        *listed,
     )
 
 

@@ -526,6 +526,19 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     assert len(database.verified_pairs(path, posed_photos(out))) >= VIEWS - 1
 
 
+def test_photos_can_be_given_in_a_list(photos, tmp_path, run_command, monkeypatch):
+    """Where they are too many for a command line."""
+    given, found = sorted((photos / "images").iterdir()), []
+    listed = tmp_path / "photos.json"
+    monkeypatch.setattr(sfm_command, "_run", lambda made_from, *_: found.append(made_from))
+    listed.write_text(json.dumps({"photos": [str(path) for path in given[1:]], "leave_out": ["b.png"]}))
+    command = "sfm", given[0], "--out", tmp_path / "capture", "--leave-out", "a.png", "--list", listed
+    run_command(*command)
+    assert found[0].photos == given and found[0].leave_out == ["a.png", "b.png"]
+    listed.write_text('["photo 1.png"]')
+    assert_rejected(run_command(*command), "is no list of photos")
+
+
 def test_photos_to_leave_out_are_found_by_the_names_that_they_had():
     photos_there = [Photo(name, "", "") for name in ("a/1.jpg", "a/2.png", "b/e\u0301.jpg")]
     told = []

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import Photos or Video: what the backend is asked for, of a folder, chosen photos and a video."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,16 @@ def test_another_set_of_photos_is_used(submitted, shown, tmp_path, used, label, 
     command = submitted[0].command
     assert "--leave-out" not in command
     assert command[command.index("--set") + 1] == number if number else "--set" not in command
+
+
+def test_names_that_are_too_long_for_a_command_line_are_given_in_a_file(submitted, tmp_path):
+    photos, leave_out = [[f"photo {number:04}.jpg" for number in numbers] for numbers in (range(500), range(7))]
+    sources = [tmp_path / "trip" / name for name in photos]
+    job = locations.sfm_job(tmp_path / "capture", PhotosSource(sources, leave_out=leave_out))
+    assert len(" ".join(job.command)) < 2000 and "--leave-out" not in job.command
+    assert job.command[job.command.index("sfm") + 1 : job.command.index("--out")] == [str(sources[0])]
+    listed = json.loads(Path(job.command[job.command.index("--list") + 1]).read_text(encoding="utf-8"))
+    assert listed == {"photos": [str(path) for path in sources[1:]], "leave_out": leave_out}
 
 
 def test_missing_folder_is_refused(submitted, tmp_path):

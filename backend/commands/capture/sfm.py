@@ -67,7 +67,9 @@ _STOPPED = "Stopped; features and matches are kept. Run the same command again t
 
 def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Find features, match the photos, compute poses and points, and write CAPTURE/sparse/0 and sfm/sfm.json."""
-    sources, capture = options.photos, options.out.absolute()  # COLMAP's processes run in another folder.
+    listed, unwanted = ([], []) if options.list is None else _read_list(options.list)
+    sources, leave_out = [*options.photos, *listed], [*options.leave_out, *unwanted]
+    capture = options.out.absolute()  # COLMAP's processes run in another folder.
     before = read_source(capture)
     if before is not None and before.photos == [path.resolve() for path in sources] and are_copied(sources, capture):
         reporter.warning(f"{_missing(sources)} does not exist any more, so its copies in {capture / IMAGES} are used.")
@@ -84,7 +86,7 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             make_folder(capture / WORK)
             with locked(capture / WORK):
                 made_from = PhotosSource(
-                    sources, options.cameras, options.frames, options.leave_out, options.features, options.set,
+                    sources, options.cameras, options.frames, leave_out, options.features, options.set,
                     options.calibration,
                     options.matcher,
                 )  # fmt: skip
@@ -97,6 +99,16 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
                 created.remove_files()
                 created.remove_folders()
             raise
+
+
+def _read_list(path: Path) -> tuple[list[Path], list[str]]:
+    """Read a list of photos, and of names to leave out."""
+    stored = read_json(path)
+    try:
+        photos, leave_out = stored.get("photos", []), stored.get("leave_out", [])
+        return [Path(photo) for photo in photos], [str(name) for name in leave_out]
+    except (AttributeError, TypeError) as error:
+        raise InputError(f'{path} is no list of photos; expected {{"photos": [...], "leave_out": [...]}}.') from error
 
 
 def _missing(sources: list[Path]) -> Path:
