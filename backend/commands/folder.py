@@ -257,8 +257,8 @@ def _no_anchors(block: Anchors) -> np.ndarray:
 
 
 def with_corrected_masks(trained: Trained, reporter: StoppingReporter) -> Capture:
-    """Return the capture of a training with its masks corrected, as the training itself does."""
-    if not trained.capture.has_masks:
+    """Return the capture of a training with its masks corrected by votes, if there are any, as the training does."""
+    if not trained.capture.has_masks or not trained.folder.points.is_file():
         return trained.capture
     ids = read_points(trained.folder.points).ids
     scene = trained.scene

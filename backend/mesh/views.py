@@ -149,15 +149,15 @@ class Views:
     def _claimed(self, index: int) -> np.ndarray:
         """Return the pixels (H, W) bool that may show the current objects, according to the photo's mask.
 
-        Pixels with the ID 0 are not supervised in training, so splats of any object may show the background there. If
-        the mask contains the objects, these pixels are not part of them.
+        Pixels with the ID 0, or whose ID is ignored, are not supervised in training, so splats of any object may show
+        the background there. If the mask contains the objects, these pixels are not part of them.
         """
         camera = self.camera(index)
         mask = self.scene.capture.mask(index, self.downscale)
         known = self.model.classes.ids_of([c for c in self._classes if c])
         if mask is None or len(known) < len(self._classes) or not np.isin(mask, known).any():
             return np.ones((camera.height, camera.width), bool)
-        return mask != 0
+        return mask > 0
 
     def _shown(self, index: int) -> np.ndarray:
         """Return the fraction (H, W) of each pixel's light in view `index` that comes from the current objects."""

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from backend.commands.objects import mesh as command
+from backend.labels.corrections import IGNORED
 from backend.mesh.surface import NoSurface
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
 from backend.shared.formats.mesh_ply import read_mesh
@@ -144,6 +145,27 @@ def test_existing_meshes_are_not_made_again(trained, run_command, monkeypatch):
         "2",
         "5",
     ]
+
+
+def test_meshes_are_made_by_corrected_masks(trained, run_command, monkeypatch):
+    """As the training: what other photos contradict is ignored, here all that one photo shows."""
+    seen = []
+
+    def corrected(trained, _reporter):
+        index = trained.capture.train_indices[0]
+        return trained.capture.with_corrected_masks({index}, lambda _, mask: np.full_like(mask, IGNORED))
+
+    def make(target, options, trained, views, part):
+        for index in views.indices[:2]:
+            assert (trained.capture.mask(index) > 0).any()
+            seen.append((views.scene.target(index)[1] >= 0).any().item())
+            views._turn_to([1])
+            seen.append(views._claimed(index).any())
+        raise Cancelled("Stopped.")
+
+    monkeypatch.setattr(command, "with_corrected_masks", corrected)
+    monkeypatch.setattr(command, "_make", make)
+    assert run_command("mesh", trained).code == EXIT_CANCELLED and seen == [False, True, True, True]
 
 
 def test_meshes_that_are_made_anew_continue_after_a_stop(trained, run_command, monkeypatch):

@@ -7,11 +7,9 @@ import shutil
 import time
 from typing import Any
 
-from ...labels import correct_masks
 from ...model.object_model import ObjectModel
 from ...shared.errors import InputError
 from ...shared.events import Reporter
-from ...shared.formats.points_ply import read_points
 from ...shared.stopping import StoppingReporter
 from ...training.fine_tuning.fit_discs import begin_discs, budget_of_discs, digest_of_model
 from ...training.trainer import Trainer
@@ -38,7 +36,7 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
     Models of discs, and models that depend on the view, are returned as they are.
 
     Args:
-        trained: The reconstruction, locked by this process.
+        trained: The reconstruction, locked by this process, whose scene has corrected masks.
         options: With the limit of memory.
         reporter: Receives the progress.
 
@@ -52,12 +50,7 @@ def model_of_discs(trained: Trained, options: argparse.Namespace, reporter: Stop
     for other in cache.glob(f"{_PREFIX}*"):
         if other != folder:
             shutil.rmtree(other, ignore_errors=True)
-    capture = trained.capture
-    if capture.has_masks and trained.folder.points.is_file():
-        # As in the training itself, where ID 0 may be an object.
-        gaps = trained.scene.supervise_background and not trained.scene.zero_is_object
-        capture, _ = correct_masks(capture, read_points(trained.folder.points).ids, ignore_gaps=gaps)
-    memory, gains = memory_for_targets(options), trained.scene.gains
+    capture, memory, gains = trained.scene.capture, memory_for_targets(options), trained.scene.gains
     try:
         resumed = Trainer.resume(capture, folder, None, memory, model.device, gains)
     except InputError:

@@ -30,7 +30,7 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
 from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, locked_reconstruction, open_trained
+from ..folder import READ, Trained, locked_reconstruction, open_trained, with_corrected_masks
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -83,7 +83,11 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         options.restart = False  # The same command would begin again.
         discs = seconds_of_discs(trained) if wanted else 0.0
         reporter.expect({DISCS: ("Fitting discs", discs), "meshes": ("Meshing", _SECONDS_A_MESH * len(wanted))})
-        model = model_of_discs(trained, options, reporter) if wanted else trained.model
+        model = trained.model
+        if wanted:
+            # The scene has read no masks so far.
+            trained.scene.capture = with_corrected_masks(trained, reporter)
+            model = model_of_discs(trained, options, reporter)
         reporter.begin("meshes", "Reading the photos")
         if len(wanted) < len(targets):
             reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
