@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from backend.commands.objects import mesh as command
 from backend.labels.corrections import IGNORED
-from backend.mesh.surface import NoSurface
+from backend.mesh.surface import NoSurface, Surface
+from backend.shared.class_table import ClassTable
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled
 from backend.shared.formats.mesh_ply import read_mesh
 from backend.shared.reconstruction.meshes import read_waiting
@@ -166,6 +169,17 @@ def test_meshes_are_made_by_corrected_masks(trained, run_command, monkeypatch):
     monkeypatch.setattr(command, "with_corrected_masks", corrected)
     monkeypatch.setattr(command, "_make", make)
     assert run_command("mesh", trained).code == EXIT_CANCELLED and seen == [False, True, True, True]
+
+
+def test_objects_that_a_mesh_of_several_lacks_are_named():
+    """Here the third one; those of few anchors and the background do not count."""
+    rng = np.random.default_rng(0)
+    ids = np.repeat([0, 1, 2, 3, 4], [20, 20, 20, 20, 3])
+    anchors = SimpleNamespace(ids=torch.tensor(ids), positions=torch.tensor(4.0 * ids[:, None] + rng.random((83, 3))))
+    model = SimpleNamespace(anchors=anchors, classes=ClassTable([0, 7, 8, 9, 12]))
+    surface = Surface(np.array([[4.5, 4.5, 4.5], [8.0, 8.5, 8.9], [8.5, 12.5, 12.5]]), np.zeros((0, 3)), np.zeros(0))
+    assert command._lacking(surface, model, np.arange(5)) == [9]
+    assert command._lacking(surface, model, np.array([1, 2])) == command._lacking(surface, model, np.array([3])) == []
 
 
 def test_meshes_that_are_made_anew_continue_after_a_stop(trained, run_command, monkeypatch):

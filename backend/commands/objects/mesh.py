@@ -28,7 +28,7 @@ from ...shared.formats.file_names import hashed_stem
 from ...shared.formats.mesh_ply import Mesh, write_mesh
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
-from ...shared.reconstruction.objects import find_object, members_of, read_objects, shown_as
+from ...shared.reconstruction.objects import default_name, find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, locked_reconstruction, open_trained, with_corrected_masks
 from ..setup.device import choose_device
@@ -41,6 +41,9 @@ SCENE = "scene"
 SCENE_BUDGET = 5
 """Factor by which the whole scene may have more faces than an object."""
 
+_FEWEST_ANCHORS, _BESIDE = 8, 0.25
+"""Number of anchors of an object from which on a mesh of several should have a part of it, and how far beside them the
+part may lie, relative to their extent."""
 _PROGRESS_FRACTIONS = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
 """Fractions of the time of one mesh, for the progress."""
 _SECONDS_A_MESH = 15.0
@@ -155,6 +158,13 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         for suffix in (".ply", ".png"):
             (folder / f"{_stem(target.key)}{suffix}").unlink(missing_ok=True)
         return replace(entry, why=str(reason))
+    if lacking := _lacking(surface, model, classes):
+        first = trained.capture.names.get(lacking[0], default_name(lacking[0]))
+        more = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
+        part.warning(
+            f"The mesh of {target.name} lacks {first}{more}, separate from the rest and small, or hardly seen; make a "
+            "mesh of each alone."
+        )
     surface = refine(surface, views, classes.tolist(), part.step("refine"))
     part.step("unwrap")
     size = options.texture_size or texture_size(surface, views)
@@ -172,6 +182,22 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         "seconds": round(time.monotonic() - started, 2),
     }
     return replace(entry, file=f"{stem}.ply", texture=f"{stem}.png", figures=figures)
+
+
+def _lacking(surface: Surface, model: ObjectModel, classes: np.ndarray) -> list[int]:
+    """Return the IDs of the objects that have no part of a surface, as small separate ones count as floaters."""
+    found: list[int] = []
+    if len(classes) < 2:
+        return found
+    ids, positions = devices.host(model.anchors.ids), devices.host(model.anchors.positions)
+    for own, object_id in zip(classes, model.classes.ids_of(classes).tolist(), strict=True):
+        points = positions[ids == own]
+        if object_id and len(points) >= _FEWEST_ANCHORS:
+            low, high = np.quantile(points, (0.02, 0.98), axis=0)
+            margin = _BESIDE * (high - low).max()
+            if not ((surface.vertices >= low - margin) & (surface.vertices <= high + margin)).all(1).any():
+                found.append(object_id)
+    return found
 
 
 def _in_world(surface: Surface, colors: np.ndarray, uvs: np.ndarray, texture: str, model: ObjectModel) -> Mesh:
