@@ -23,8 +23,8 @@ from .extension import PACKAGE, ROOT
 from .worker.layout import VERSIONS
 
 _LONGEST_NAMES = 8000
-"""Number of characters of photos' names from which on they are given in a file; a command line of Windows has 32,767 for
-everything, with a space and two quotes for each name."""
+"""Number of characters of photos' names from which on they are given in a file; a command line of Windows has 32,767
+for everything, with a space and two quotes for each name."""
 
 
 def preferences() -> Any:
