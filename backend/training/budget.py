@@ -43,8 +43,8 @@ than the third number of views would be left to train on: the few that could be 
 tell about it."""
 
 DECAY_FROM = 0.8
-"""Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; in the rest, the
-validation views are trained on, too."""
+"""Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; after that, it
+trains on the validation views, too."""
 
 
 @dataclass
