@@ -22,7 +22,6 @@ from ..shared.errors import (
     EXIT_FAILED,
     Cancelled,
     InputError,
-    MissingPackage,
     ProcessLost,
     describe_missing_package,
 )
@@ -111,7 +110,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
             run(options, StoppingReporter(StagedReporter(reporter), stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
-        fields = error.fields if isinstance(error, MissingPackage) else {}
+        fields = error.fields if isinstance(error, InputError) else {}
         _tell(functools.partial(reporter.error, **fields), _shortened(str(error)))
         return EXIT_BAD_INPUT
     except (Cancelled, KeyboardInterrupt) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 EXIT_DONE = 0
 EXIT_FAILED = 1
@@ -11,7 +12,19 @@ EXIT_CANCELLED = 130
 
 
 class InputError(Exception):
-    """Invalid user input; the message is one plain sentence that names the file."""
+    """Invalid user input; the message is one plain sentence that names the file.
+
+    Attributes:
+        fields: More fields of the event that reports it.
+    """
+
+    fields: dict[str, Any] = {}
+
+
+class NothingMade(InputError):
+    """The input is valid, but a command can make nothing of it, as without a surface or without held-out views."""
+
+    fields = {"nothing_made": True}
 
 
 class MissingPackage(InputError):

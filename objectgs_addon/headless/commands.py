@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
+from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError, NothingMade
 from ...backend.shared.events import Reporter
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.stopping import StopRequest
@@ -160,7 +160,7 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
     for command in ["evaluate"] if options.no_meshes else ["mesh", "evaluate"]:
         try:
             run_backend(options.reporter, command, folder, folder)
-        except InputError as error:  # Splats without a surface, or without held-out views, are still a valid result.
+        except NothingMade as error:  # Splats without a surface, or without held-out views, are still a valid result.
             options.reporter.warning(str(error))
     run_backend(options.reporter, "report", folder, folder)
     has_meshes = build_blend(folder, folder / BLEND, options.reporter)
@@ -285,6 +285,7 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
         arguments: arguments of the command.
 
     Raises:
+        NothingMade: the backend could make nothing of valid input.
         InputError: the backend refused the input.
         Cancelled: the user cancelled.
         StepFailed: the command failed for another reason.
@@ -296,7 +297,7 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
     if code == EXIT_CANCELLED:
         raise Cancelled
     if code == EXIT_BAD_INPUT:
-        raise InputError(job.error)
+        raise (NothingMade if job.nothing_made else InputError)(job.error)
     raise StepFailed(job.error)
 
 

@@ -446,6 +446,8 @@ def test_too_few_views_skip_evaluation(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=2, size=(64, 48)).folder, tmp_path / "out"
     assert run_command("train", capture, "--out", out, "--steps", 3, *SMALL).code == EXIT_DONE
     assert_rejected(run_command("evaluate", out), str(capture), "too few views")
+    assert run_command("evaluate", out, "--json").events[-1]["nothing_made"] is True
+    assert "nothing_made" not in run_command("evaluate", out / "missing", "--json").events[-1]
     assert run_command("render", out).code == EXIT_DONE and len(list((out / "renders").iterdir())) == 2
     assert run_command("report", out).code == EXIT_DONE
     report = json.loads((out / "report.json").read_text())

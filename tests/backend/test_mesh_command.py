@@ -231,6 +231,7 @@ def test_object_without_surface_is_reported(trained, run_command, monkeypatch):
     assert result.messages("warning") == ["No view shows sphere 2."] == [entries(trained)["2"]["why"]]
     Stub(monkeypatch, without={"1", "2", "5"})
     assert_rejected(run_command("mesh", trained, "--restart", "--objects", "2"), "No view shows sphere 2.")
+    assert run_command("mesh", trained, "--objects", "2", "--json").events[-1]["nothing_made"] is True
 
 
 def test_missing_surface_removes_earlier_mesh(trained, run_command, monkeypatch):

@@ -286,13 +286,35 @@ def test_make_demo_reconstructs_around_its_capture(capture, backend_python, tmp_
 def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "out")
     python, _ = fake_python(
-        tmp_path, backend_python, 'echo \'{"type": "error", "message": "No mesh can be made."}\'; exit 2'
+        tmp_path,
+        backend_python,
+        'echo \'{"type": "error", "message": "No mesh can be made.", "nothing_made": true}\'; exit 2',
     )
     ran = run("run", capture, "--out", folder, "--steps", "30", *SIZE, "--backend-python", python)
     assert ran.returncode == 0, ran.output + ran.errors
     assert "warning: No mesh can be made." in ran.errors
     assert (folder / "render.png").is_file() and not (folder / "pulled-apart.png").exists()
     assert "No mesh can be made" in error_report("mesh", folder, "--backend-python", python)
+
+
+def test_meshes_that_fail_for_another_reason_end_a_run(capture, tmp_path, monkeypatch, capsys):
+    """The backend has the same exit code for them as for splats without a surface."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    python = tmp_path / "python"
+    python.write_text("""#!/bin/sh
+[ "$3" = mesh ] || exec echo '{"type": "done"}'
+echo '{"type": "error", "message": "The memory of the GPU is full."}'
+exit 2
+""")
+    python.chmod(0o755)
+    out = tmp_path / "out"
+    assert headless.main(["run", str(capture), "--out", str(out), "--backend-python", str(python)]) == 2
+    assert "error: The memory of the GPU is full." in capsys.readouterr().err and not (out / "objectgs.blend").exists()
+    shutil.copytree(capture, tmp_path / "captures" / "one")
+    assert (
+        headless.main(["batch", str(tmp_path / "captures"), "--out", str(out), "--backend-python", str(python)]) == 2
+    )
+    assert summary(out)["one"]["state"] == "bad input" and "memory" in summary(out)["one"]["error"]
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.object_model import ObjectModel
 from ...raster import devices
-from ...shared.errors import InputError
+from ...shared.errors import InputError, NothingMade
 from ...shared.events import Reporter
 from ...shared.formats.atomic import write_atomic
 from ...shared.formats.file_names import hashed_stem
@@ -107,7 +107,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             finish_stage(folder, "mesh", time.monotonic() - started)
     made = [target.key for target in targets if target.key in known and known[target.key].file]
     if not made:
-        raise InputError(f"No mesh could be made: {known[targets[0].key].why}")
+        raise NothingMade(f"No mesh could be made: {known[targets[0].key].why}")
     reporter.done(meshes=str(folder.meshes), made=len(made), without=len(targets) - len(made))
 
 

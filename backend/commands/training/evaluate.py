@@ -11,7 +11,7 @@ from ...evaluation import evaluate as evaluate_views
 from ...evaluation.meshes import evaluate_mesh, mesh_entries
 from ...evaluation.truth import load_truth
 from ...model.draw import draw, objects_alone
-from ...shared.errors import InputError
+from ...shared.errors import NothingMade
 from ...shared.reconstruction.report import Evaluation, write_evaluation
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
@@ -25,7 +25,9 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     if not capture.test_indices:
-        raise InputError(f"{capture.folder} holds out no view or has too few views for it, so nothing can be measured.")
+        raise NothingMade(
+            f"{capture.folder} holds out no view or has too few views for it, so nothing can be measured."
+        )
     reporter.begin("views", f"Measuring on the {len(capture.test_indices)} held-out views")
 
     def drawn(index: int) -> tuple[np.ndarray, np.ndarray]:
