@@ -7,6 +7,7 @@ and reconstructions are matched by folder.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 import traceback
@@ -161,7 +162,7 @@ def _tick() -> float | None:
         if job.take_preview() and job.folder is not None:
             _guard(job, previews.refresh, job.folder)
         if job.is_finished:
-            _handle_end(job)
+            _guard(job, _handle_end, job)
     _show_results()
     _redraw_soon(any(job.is_finished or job.state is not State.RUNNING for job in changed), bool(changed))
     return INTERVAL if _results or any(not job.is_finished for job in queue.jobs) else None
@@ -222,9 +223,11 @@ def _remedy(job: Job) -> tuple[str, str, dict[str, Any]]:
     if job.kind in _REMEDIES:
         return _REMEDIES[job.kind]
     root = next(iter(results.roots_of(job.folder)), None)
-    if root is not None and is_capture_gone(folder_trust.state_of(root)):
-        step = find_step(root)
-        return step.operator, f"{step.label}...", dict(step.options)
+    # A folder on a network can fail at any time.
+    with contextlib.suppress(OSError):
+        if root is not None and is_capture_gone(folder_trust.state_of(root)):
+            step = find_step(root)
+            return step.operator, f"{step.label}...", dict(step.options)
     return "objectgs.retry_job", "Try Again", {"number": job.number}
 
 

@@ -28,7 +28,7 @@ from objectgs.objectgs_addon.panels.objects import ObjectsPanel
 from objectgs.objectgs_addon.panels.training.train import TrainPanel
 from objectgs.objectgs_addon.process.jobs import Job, State
 from objectgs.objectgs_addon.running import background, handlers, results
-from objectgs.objectgs_addon.state import object_list
+from objectgs.objectgs_addon.state import folder_trust, object_list
 
 from .drawn import texts_of
 
@@ -632,6 +632,27 @@ def test_failed_result_does_not_stop_other_jobs(extension, folder, popups, tmp_p
     tick_until(lambda: works.is_finished and not background._results)
     assert broken.state is State.DONE and bpy.context.scene.objectgs.active is not None
     assert popups == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
+
+
+def test_folder_that_fails_does_not_stop_other_jobs(shown, folder, tmp_path, monkeypatch):
+    """As a folder on a network at the moment when a job ends."""
+
+    def fails(_folder):
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder / "points.ply"))
+
+    refused = json.dumps({"type": "error", "message": "No image is there."})
+    broken = start(job(tmp_path, f"print({refused!r})\nraise SystemExit(2)", folder=folder), bpy.context.scene)
+    trained, waiting = start(job(tmp_path, folder=folder), bpy.context.scene), start(job(tmp_path), bpy.context.scene)
+    told, finished = [], []
+    monkeypatch.setattr(messages, "show", lambda message, *_options, **_more: told.append(message))
+    monkeypatch.setattr(background, "finish", finished.append)
+    monkeypatch.setattr(folder_trust, "folder_state", fails)
+    tick_until(lambda: waiting.is_finished and not background._results)
+    assert broken.state is State.FAILED and told == ["Fake: No image is there."] and finished == [trained, waiting]
+    monkeypatch.setattr(background, "_remedy", fails)
+    broken, waiting = start(job(tmp_path, folder=folder), bpy.context.scene), start(job(tmp_path), bpy.context.scene)
+    tick_until(lambda: waiting.is_finished)
+    assert "points.ply" in told[1]
 
 
 def test_unregister_stops_running_job(extension, folder, popups, tmp_path):
