@@ -171,7 +171,10 @@ def remove(folder: str | Path) -> None:
     folder = Path(folder)
     if not os.path.lexists(folder):
         return
-    own = {layout.STAMP, layout.MARKER, layout.MARKER + ".part", layout.VENV, layout.OLD, layout.TEMPORARY}
+    own = {
+        layout.STAMP, layout.MARKER, layout.MARKER + ".part", layout.OLD_MARKER, layout.VENV, layout.OLD,
+        layout.TEMPORARY,
+    }  # fmt: skip
     if not layout.is_ours(folder) or not own.issuperset(path.name for path in folder.iterdir()):
         raise OSError(errno.ENOTEMPTY, "it contains files that are not ObjectGS's", str(folder))
     away = folder.with_name(f"{folder.name}{layout.REMOVED}{os.getpid()}-{next(_removed)}")

@@ -127,6 +127,11 @@ def test_setup_succeeds_after_killed_setup(root):
     state = environment.inspect(folder)
     assert state.state == "ready" and "PyTorch 2.13.0" in state.sentence
     assert not (folder / "venv" / "leftover").exists() and not (folder / "tmp").exists()
+
+    job = environment.set_up_job(sys.executable, folder, "cpu")
+    run(job, lambda: job.message == "Making an environment", job.stop)
+    assert job.state is State.STOPPED and job.message == "Stopped; the earlier environment is kept."
+    assert environment.inspect(folder) == state
     found = subprocess.run(
         [state.python, "-c", "import smallnumba, torch; print(torch.__version__)"],
         capture_output=True,
@@ -570,7 +575,50 @@ def test_environment_in_use_is_kept(root, monkeypatch):
             pass
     assert (folder / "venv").is_dir() and (folder / layout.MARKER).is_file()
     with setup.claimed(folder):
-        assert sorted(path.name for path in folder.iterdir()) == [layout.STAMP]
+        assert environment.inspect(folder).state == "incomplete"
+    assert [path.name for path in folder.iterdir()] == [layout.STAMP]
+
+
+def make(folder, text):
+    """Make a complete environment whose marker has a text."""
+    with setup.claimed(folder):
+        (folder / "venv").mkdir()
+        (folder / "venv" / text).touch()
+        (folder / layout.MARKER).write_text(text)
+
+
+def assert_complete(folder, text):
+    assert sorted(path.name for path in folder.iterdir()) == [layout.STAMP, layout.MARKER, "venv"]
+    assert (folder / layout.MARKER).read_text() == text
+    assert [path.name for path in (folder / "venv").iterdir()] == [text]
+
+
+def test_failed_setup_puts_earlier_environment_back(root):
+    folder = root / "environment"
+    make(folder, "first")
+    with pytest.raises(events.Stopped), setup.claimed(folder):
+        for name in ("venv", "tmp"):
+            (folder / name).mkdir()
+        (folder / "ready.json.part").touch()
+        raise events.Stopped
+    assert_complete(folder, "first")
+    make(folder, "second")
+    assert_complete(folder, "second")
+
+
+def test_environment_survives_killed_setup(root):
+    folder = root / "environment"
+    make(folder, "first")
+    setup._put_aside(folder)
+    (folder / "venv" / "leftover").mkdir(parents=True)
+    assert environment.inspect(folder).state == "incomplete"
+    with pytest.raises(ZeroDivisionError), setup.claimed(folder):
+        assert not (folder / "venv").exists()
+        raise ZeroDivisionError
+    assert_complete(folder, "first")
+    setup._put_aside(folder)
+    environment.remove(folder)
+    assert not folder.exists()
 
 
 def test_requirements_are_pinned():

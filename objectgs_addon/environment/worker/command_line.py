@@ -10,6 +10,7 @@ from pathlib import Path
 from .additions import add
 from .checks import probe
 from .events import Refused, Stopped, StopRequest, emit
+from .layout import MARKER
 from .setup import set_up
 
 
@@ -34,7 +35,10 @@ def main() -> int:
         emit("error", message=str(refusal))
         return 2
     except Stopped:
-        what = "nothing of the environment is kept" if options.command == "setup" else "nothing was changed"
+        what = "nothing was changed"
+        if options.command == "setup":
+            is_kept = (options.folder / MARKER).exists()
+            what = "the earlier environment is kept" if is_kept else "nothing of the environment is kept"
         emit("done", stopped=True, message=f"Stopped; {what}.")
         return 130
     except OSError as error:

@@ -12,13 +12,14 @@ import subprocess
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 MARKER = "ready.json"
 STAMP = "objectgs-environment"
 VENV = "venv"
-OLD = "venv-old"
+OLD, OLD_MARKER = "venv-old", "ready-old.json"
+"""An earlier environment and its marker, until the set-up of a new one is complete."""
 TEMPORARY = "tmp"
 REMOVED = ".removed-"
 """Infix of the name of a folder that is being removed."""
@@ -77,7 +78,7 @@ def is_ours(folder: Path) -> bool:
 def remove_own(folder: Path, seconds: float = 10.0) -> None:
     """Remove the files of the setup from `folder`, then the folder itself if it is empty.
 
-    The marker is removed first and the stamp last.
+    The markers are removed first and the stamp last.
 
     Args:
         folder: folder of an environment.
@@ -86,22 +87,28 @@ def remove_own(folder: Path, seconds: float = 10.0) -> None:
     Raises:
         OSError: files are still in use after that time.
     """
+    for name in (MARKER, OLD_MARKER):
+        (folder / name).unlink(missing_ok=True)
+    remove_folders([folder / name for name in (VENV, OLD, TEMPORARY)], seconds)
+    (folder / (MARKER + ".part")).unlink(missing_ok=True)
+    (folder / STAMP).unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def remove_folders(folders: Iterable[Path], seconds: float = 10.0) -> None:
+    """Remove those of the folders that exist; `seconds` and errors are as for `remove_own`."""
     deadline: float | None = None
-    (folder / MARKER).unlink(missing_ok=True)
-    for name in (VENV, OLD, TEMPORARY):
-        while os.path.lexists(folder / name):
+    for folder in folders:
+        while os.path.lexists(folder):
             try:
-                shutil.rmtree(long_path(folder / name))
+                shutil.rmtree(long_path(folder))
             except OSError:
                 # From the first failure on, since the removal itself may take long.
                 deadline = deadline or time.monotonic() + seconds
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.2)
-    (folder / (MARKER + ".part")).unlink(missing_ok=True)
-    (folder / STAMP).unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
-        folder.rmdir()
 
 
 def long_path(path: Path) -> str:

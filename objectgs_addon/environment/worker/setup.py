@@ -40,7 +40,7 @@ _STAMP_TEXT = "ObjectGS for Blender keeps the Python packages of its backend her
 
 
 def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
-    """Create the environment in `options.folder`; on failure, remove its files.
+    """Create the environment in `options.folder`; on failure, remove its files and put an earlier one back.
 
     Raises:
         Refused: the environment cannot be created.
@@ -105,7 +105,9 @@ def _write_marker(folder: Path, ready: dict[str, Any], stop: Callable[[], bool])
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Lock `folder` for this process and remove an earlier environment; on exceptions in the body, remove the folder.
+    """Lock `folder` for this process, and replace an earlier environment by what the body makes.
+
+    On exceptions in the body, the earlier environment is put back; if there is none, the folder is removed.
 
     Raises:
         Refused: the folder contains other files, or another process is using it; nothing is changed.
@@ -120,10 +122,9 @@ def claimed(folder: Path) -> Iterator[None]:
         stamp = opened.enter_context((folder / layout.STAMP).open("a+", encoding="utf-8"))
         if not _lock(stamp):
             raise Refused(f"Another Blender is setting up the backend in {folder}; wait for it.")
-        _put_aside(folder)
-        (folder / layout.MARKER).unlink(missing_ok=True)
+        is_complete = _put_aside(folder)
         try:
-            for name in (layout.OLD, layout.TEMPORARY):
+            for name in (layout.VENV, layout.TEMPORARY, *(() if is_complete else (layout.OLD,))):
                 if (folder / name).is_dir():
                     emit("status", message="Removing the previous environment")
                     shutil.rmtree(layout.long_path(folder / name))
@@ -132,26 +133,54 @@ def claimed(folder: Path) -> Iterator[None]:
             stamp.flush()
             yield
         except BaseException:
-            # Windows cannot remove open files.
-            opened.close()
             # The next setup removes what is still in use; why this one failed is what the user has to know.
             with contextlib.suppress(OSError):
-                layout.remove_own(folder)
+                if is_complete:
+                    _put_back(folder)
+                else:
+                    # Windows cannot remove open files.
+                    opened.close()
+                    layout.remove_own(folder)
             raise
+        if is_complete:
+            emit("status", message="Removing the previous environment")
+            with contextlib.suppress(OSError):
+                (folder / layout.OLD_MARKER).unlink()
+            shutil.rmtree(layout.long_path(folder / layout.OLD), ignore_errors=True)
 
 
-def _put_aside(folder: Path) -> None:
-    """Rename the earlier environment in `folder`; raise Refused, with nothing changed, if Windows says it is in use."""
-    if not (folder / layout.VENV).is_dir():
-        return
-    shutil.rmtree(layout.long_path(folder / layout.OLD), ignore_errors=True)
-    try:
-        _replace(folder / layout.VENV, folder / layout.OLD)
-    except OSError as error:
-        raise Refused(
-            f"The backend in {folder} is in use by a job or by Mark Objects in this or another Blender "
-            f"({error.strerror}); end it, and try again."
-        ) from error
+def _put_aside(folder: Path) -> bool:
+    """Rename the earlier environment in `folder` and its marker; return whether it is a complete one.
+
+    Raises:
+        Refused: Windows says that it is in use; nothing is changed.
+    """
+    marker, old_marker = folder / layout.MARKER, folder / layout.OLD_MARKER
+    if not marker.exists() and old_marker.exists() and (folder / layout.OLD).is_dir():
+        # A setup that was killed has put it aside.
+        return True
+    if (folder / layout.VENV).is_dir():
+        shutil.rmtree(layout.long_path(folder / layout.OLD), ignore_errors=True)
+        try:
+            _replace(folder / layout.VENV, folder / layout.OLD)
+        except OSError as error:
+            raise Refused(
+                f"The backend in {folder} is in use by a job or by Mark Objects in this or another Blender "
+                f"({error.strerror}); end it, and try again."
+            ) from error
+    if not marker.exists():
+        return False
+    _replace(marker, old_marker)
+    return (folder / layout.OLD).is_dir()
+
+
+def _put_back(folder: Path) -> None:
+    """Restore the earlier environment that `_put_aside` has renamed."""
+    layout.remove_folders([folder / layout.VENV])
+    _replace(folder / layout.OLD, folder / layout.VENV)
+    _replace(folder / layout.OLD_MARKER, folder / layout.MARKER)
+    (folder / (layout.MARKER + ".part")).unlink(missing_ok=True)
+    layout.remove_folders([folder / layout.TEMPORARY])
 
 
 def _replace(path: Path, target: Path) -> None:
