@@ -34,6 +34,7 @@ _PHRASES = {
     "or use `masks`": "or use Import Masks",
     "which --text and --detector are for": "which Names is for",
     "choose a folder with one as MASKS": "clear Names, or choose a folder with one",
+    "`doctor`": "Check Backend",
 }
 """Advice that has other words in Blender."""
 _ONLY_TYPED = (

@@ -1,5 +1,6 @@
 """The test of a GPU before its first use: what it compares, and what follows from its outcome."""
 
+import signal
 import sys
 import time
 from threading import Event
@@ -119,18 +120,24 @@ def test_a_gpu_is_tested_once(with_gpu, monkeypatch):
 def test_a_gpu_with_other_results_is_not_used(with_gpu):
     choose = with_gpu('print(\'{"problem": "the losses of discs differ by 7.0%"}\')')
     failure = "cuda (Card) fails a test (the losses of discs differ by 7.0%)"
-    warning = f"Warning: {failure}, so the CPU is used; a newer driver of the GPU may help."
+    warning = f"Warning: {failure}, so the CPU is used; a newer driver of the GPU may help, and `doctor` tests it again."
     assert choose() == (devices.CPU, ["Testing cuda (Card), once", warning])
     assert choose() == (devices.CPU, [warning]) and choose.runs() == 1
     with pytest.raises(InputError) as error:
         choose("cuda")
-    assert str(error.value) == f"{failure}; choose --device cpu, or install a newer driver of the GPU."
+    advice = "choose --device cpu, or install a newer driver of the GPU; `doctor` tests it again."
+    assert str(error.value) == f"{failure}; {advice}"
 
 
 @pytest.mark.parametrize(("code", "problem", "kept"), [
     ("raise RuntimeError('CUDA error: an illegal memory access was encountered')",
      "RuntimeError: CUDA error: an illegal memory access was encountered", True),
     ("raise RuntimeError('CUDA out of memory.')", "RuntimeError: CUDA out of memory", False),
+    ("raise RuntimeError('CUDA error: CUDA-capable device(s) is/are busy or unavailable')",
+     "RuntimeError: CUDA error: CUDA-capable device(s) is/are busy or unavailable", False),
+    ("import signal; signal.raise_signal(signal.SIGTERM)", f"it ended with exit code {-signal.SIGTERM}", False),
+    ("raise KeyboardInterrupt", "KeyboardInterrupt", False),
+    ("import os; os.abort()", f"it ended with exit code {-signal.SIGABRT}", True),
     ("import os; os._exit(7)", "it ended with exit code 7", True),
     ("print('nothing of use')", "it ended with exit code 0", True),
 ])  # fmt: skip

@@ -30,7 +30,12 @@ _ROOT = Path(__file__).parents[3]
 _TEST = (sys.executable, "-m", "backend.commands.setup.self_test")
 _LONGEST, _POLLED_EVERY, _ENDS_WITHIN = 900.0, 0.3, 10.0
 """Seconds after which the test has failed, as it compiles kernels, too, between two looks at it, and for its end."""
-_OUT_OF_MEMORY = re.compile("out.of.memory", re.IGNORECASE)
+_PASSING = re.compile(
+    r"out.of.memory|busy or unavailable|^KeyboardInterrupt|^it ended with exit code (?:-2|-9|-15|3221225786)$",
+    re.IGNORECASE,
+)
+"""Problems that are not the GPU's: other programs use it or its memory, or the test was ended by the user or the system
+(with SIGINT, SIGKILL, SIGTERM or, on Windows, an interrupt)."""
 
 
 def choose_device(requested: str, reporter: Reporter, again: bool = False) -> torch.device:
@@ -57,16 +62,16 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
     if problem is None:
         reporter.status(f"Testing {devices.name_of(device)}, once")
         problem = _test(device, reporter)
-        # Other programs may have used the memory. Without a writable folder, the next command tests again, too.
-        if not _OUT_OF_MEMORY.search(problem):
+        # Without a writable folder, the next command tests again, too.
+        if not _PASSING.search(problem):
             with contextlib.suppress(OSError):
                 write_json(_outcome(device), {"problem": problem})
     if not problem:
         return device
     failure = f"{devices.name_of(device)} fails a test ({problem})"
     if requested == "cuda":
-        raise InputError(f"{failure}; choose --device cpu, or install a newer driver of the GPU.")
-    reporter.warning(f"{failure}, so the CPU is used; a newer driver of the GPU may help.")
+        raise InputError(f"{failure}; choose --device cpu, or install a newer driver of the GPU; `doctor` tests it again.")
+    reporter.warning(f"{failure}, so the CPU is used; a newer driver of the GPU may help, and `doctor` tests it again.")
     return devices.CPU
 
 
