@@ -58,15 +58,18 @@ def _user_cache() -> Path:
 
 
 def _why_not(folder: Path) -> str | None:
-    """Create `folder` for this user alone if it is missing; return why it is not private, or None if it is."""
+    """Create `folder` for this user alone if it is missing; return why it is not used, or None if it is."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.stat()
+        # On Windows, the user's folders are private by their access lists.
+        if sys.platform != "win32":
+            found = folder.stat()
+            if found.st_uid != os.geteuid():
+                return "belongs to another user"
+            if found.st_mode & 0o022:
+                return "can be written by other users"
+        # numba fails where it cannot write, as on a disk that is mounted read-only.
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         return f"cannot be used ({error.strerror})"
-    # On Windows, the user's folders are private by their access lists.
-    if sys.platform == "win32":
-        return None
-    if found.st_uid != os.geteuid():
-        return "belongs to another user"
-    return "can be written by other users" if found.st_mode & 0o022 else None
+    return None

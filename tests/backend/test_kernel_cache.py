@@ -1,5 +1,6 @@
 """Compiled kernels, which numba stores as pickles, are loaded only from a folder that nobody else can write."""
 
+import errno
 import json
 import os
 import subprocess
@@ -75,6 +76,22 @@ def test_without_a_usable_folder_kernels_are_kept_for_one_process(home, monkeypa
     monkeypatch.setattr(kernel_cache, "_user_cache", lambda: home / "file")
     assert f"{home / 'file' / 'kernels'} cannot be used (" in use_private_cache()
     assert used().is_dir() and not any(used().iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_not_used(home, monkeypatch):
+    (home / "kernels").mkdir(mode=0o500)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(home / "kernels"))
+    create = kernel_cache.tempfile.TemporaryFile
+
+    def read_only(dir):
+        if dir == home / "kernels":
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(dir))
+        return create(dir=dir)
+
+    monkeypatch.setattr(kernel_cache.tempfile, "TemporaryFile", read_only)
+    assert f"{home / 'kernels'} cannot be used (Read-only file system), so it is not used" in use_private_cache()
+    assert used() != home / "kernels" and used().is_relative_to(home)
+    assert not any((home / "kernels").iterdir())
 
 
 def test_a_user_without_a_home(home, monkeypatch):
