@@ -102,7 +102,9 @@ def test_flamenco_renders_a_film_by_ranges():
     tasks = compiled("flamenco-film.js", blend="/s.blend", out="/f", frames="1-24,50-80", objectgs="/x")
     arguments = [task["commands"][0]["parameters"]["args"] for task in tasks]
     assert [words[words.index("--frames") + 1] for words in arguments] == ["1-24", "50-80"]
-    assert all(words[:2] == ["-b", "-P"] and words[4] == "film" for words in arguments)
+    assert all(words[:2] == ["-b", "-P"] and words[4] == "film" and "--dir" not in words for words in arguments)
+    moved = compiled("flamenco-film.js", blend="/s.blend", out="/f", frames="1", objectgs="/x", dir="/a b")
+    assert moved[0]["commands"][0]["parameters"]["args"][-2:] == ["--dir", "/a b"]
 
 
 def test_flamenco_measures_each_capture_in_a_task(tmp_path):
