@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -37,6 +38,7 @@ COMMANDS = {
 
 def main(arguments: list[str]) -> int:
     """Run one command line and return the exit code."""
+    _prepare_streams()
     reporter: Reporter = JsonReporter() if "--json" in arguments else ConsoleReporter()
     try:
         options = parse(arguments)
@@ -65,6 +67,13 @@ def main(arguments: list[str]) -> int:
         traceback.print_exc()
         reporter.error(f"Unexpected error: {type(error).__name__}: {' '.join(str(error).split())}")
         return EXIT_FAILED
+
+
+def _prepare_streams() -> None:
+    """Let the output streams escape characters that their encoding does not have, as in files on Windows."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextlib.contextmanager
