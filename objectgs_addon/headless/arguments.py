@@ -178,6 +178,7 @@ def _parser() -> argparse.ArgumentParser:
     mesh = command(
         "mesh", "make a textured mesh of each object", _MESH, takes="DIR", usage="headless.py mesh DIR [OPTIONS]"
     )
+    mesh.add_argument("--capture", type=Path, metavar="CAPTURE", help="the capture's present folder, if it was moved")
     _backend_python(mesh)
     for name, (summary, description) in _RESULT_COMMANDS.items():
         out = " --out PATH" if name == "export" else ""
@@ -244,6 +245,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_TRAIN_OPTIONS,
     )
     _backend(batch)
+    _groups(batch)
     _meshes(batch)
     _picture(batch)
     return top

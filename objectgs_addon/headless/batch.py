@@ -12,10 +12,11 @@ from typing import Any
 from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
 from ...backend.shared.formats.json_file import read_json, write_json
+from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.report import MIOU_LABELS, read_report
 from ...backend.shared.version import __version__
-from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, reconstruct, sentence
+from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, path_options, reconstruct, sentence
 
 DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished"
 
@@ -40,7 +41,7 @@ def batch(options: argparse.Namespace) -> None:
     find_backend(options.backend_python)
     settings = {
         "version": __version__,
-        "train": options.rest,
+        "train": [*path_options(options), *options.rest],
         "engine": options.engine,
         "samples": options.samples,
         "size": list(options.size) if options.size else None,
@@ -49,9 +50,15 @@ def batch(options: argparse.Namespace) -> None:
     Reconstruction(out).create()
     summary = _Summary(out, captures)
     for number, capture in enumerate(captures, 1):
-        wanted = {**settings, "capture": str(capture), "files": fingerprint(capture)}
         entry = summary.entry(capture.name)
         title = f"{capture.name} ({number} of {len(captures)})"
+        try:
+            wanted = {**settings, "capture": str(capture), "files": fingerprint(capture)}
+        except OSError as error:
+            entry.update(_NOTHING, settings=None, state=BAD_INPUT, error=sentence(error))
+            summary.write()
+            options.reporter.status(f"== {title}: {entry['error']}")
+            continue
         if _is_done(entry, wanted, out / capture.name):
             options.reporter.status(f"== {title}: already done.")
             continue
@@ -67,10 +74,11 @@ def batch(options: argparse.Namespace) -> None:
 def _captures(source: Path) -> list[Path]:
     """Return the subfolders with images/ or sparse/, sorted by name."""
     try:
-        folders = sorted(entry for entry in source.iterdir() if entry.is_dir())
+        folders = sorted(entry for entry in source.iterdir() if is_folder(entry))
     except OSError as error:
         raise InputError(f"The folder {source} cannot be read ({error.strerror}).") from error
-    found = [folder for folder in folders if (folder / "images").is_dir() or (folder / "sparse").is_dir()]
+    # Of folders such as lost+found, which may not be read, nothing is known.
+    found = [folder for folder in folders if is_folder(folder / "images") or is_folder(folder / "sparse")]
     if not found:
         raise InputError(f"The folder {source} contains no captures: no subfolder has images/ or sparse/.")
     return found

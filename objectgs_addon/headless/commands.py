@@ -75,7 +75,7 @@ def backend(options: argparse.Namespace) -> None:
         absolute(Path(options.source)),
         "--out",
         folder,
-        *_groups(options),
+        *path_options(options),
         *options.rest,
     )
 
@@ -86,7 +86,7 @@ def plan(options: argparse.Namespace) -> None:
     folder = absolute(options.out) if options.out else None
     out = ("--out", folder) if folder else ()
     run_backend(
-        options.reporter, "plan", folder, absolute(Path(options.source)), *out, *_groups(options), *options.rest
+        options.reporter, "plan", folder, absolute(Path(options.source)), *out, *path_options(options), *options.rest
     )
 
 
@@ -95,14 +95,13 @@ def on_result(options: argparse.Namespace) -> None:
     find_backend(options.backend_python)
     folder = absolute(Path(options.source))
     out = ("--out", absolute(options.out)) if options.command == "export" else ()
-    run_backend(options.reporter, options.command, folder, folder, *out, *options.rest)
+    run_backend(options.reporter, options.command, folder, folder, *out, *path_options(options), *options.rest)
 
 
 def import_splats(options: argparse.Namespace) -> None:
     """Run the backend's import-splats command on splats from another program."""
     find_backend(options.backend_python)
     folder = absolute(options.out)
-    capture = ("--capture", absolute(options.capture)) if options.capture else ()
     run_backend(
         options.reporter,
         "import-splats",
@@ -110,7 +109,7 @@ def import_splats(options: argparse.Namespace) -> None:
         absolute(Path(options.source)),
         "--out",
         folder,
-        *capture,
+        *path_options(options),
         *options.rest,
     )
 
@@ -155,7 +154,7 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
     """Create splats, meshes, a report, a .blend and images of `capture` in `folder`; continue an earlier run."""
     no_meshes = ["--no-meshes"] if options.no_meshes else []
     run_backend(
-        options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *_groups(options), *options.rest
+        options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *path_options(options), *options.rest
     )
     for command in ["evaluate"] if options.no_meshes else ["mesh", "evaluate"]:
         try:
@@ -180,10 +179,10 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
         options.reporter.status(f"Wrote {folder / APART_PICTURE}.")
 
 
-def _groups(options: argparse.Namespace) -> tuple[object, ...]:
-    """Return the backend's option --groups with an absolute path, or nothing if it was not given."""
-    path = vars(options).get("groups")
-    return ("--groups", absolute(path)) if path else ()
+def path_options(options: argparse.Namespace) -> list[str]:
+    """Return those of the backend's options --capture and --groups that were given, with absolute paths."""
+    given = {name: vars(options).get(name) for name in ("capture", "groups")}
+    return [word for name, path in given.items() if path for word in (f"--{name}", str(absolute(path)))]
 
 
 def _render_apart(blend: Path, out: Path, options: argparse.Namespace) -> None:

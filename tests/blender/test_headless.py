@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """headless.py: output of its commands, exit codes, and stopping at any time."""
 
+import errno
 import json
 import math
 import os
@@ -9,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -311,9 +313,7 @@ exit 2
     assert headless.main(["run", str(capture), "--out", str(out), "--backend-python", str(python)]) == 2
     assert "error: The memory of the GPU is full." in capsys.readouterr().err and not (out / "objectgs.blend").exists()
     shutil.copytree(capture, tmp_path / "captures" / "one")
-    assert (
-        headless.main(["batch", str(tmp_path / "captures"), "--out", str(out), "--backend-python", str(python)]) == 2
-    )
+    assert headless.main(["batch", str(tmp_path / "captures"), "--out", str(out), "--backend-python", str(python)]) == 2
     assert summary(out)["one"]["state"] == "bad input" and "memory" in summary(out)["one"]["error"]
 
 
@@ -486,6 +486,54 @@ def test_batch_fingerprint_changes_with_capture(capture, tmp_path):
     mask = min((tmp_path / "a" / "masks").iterdir())
     mask.write_bytes(mask.read_bytes())
     assert fingerprint(tmp_path / "a") != before
+
+
+def test_batch_goes_on_after_unreadable_folders(capture, tmp_path, monkeypatch, capsys):
+    """As with "System Volume Information" of Windows, or a capture whose photos another user may not read."""
+    captures, out, echo = tmp_path / "captures", tmp_path / "out", tmp_path / "python"
+    for name in ("a", "b"):
+        shutil.copytree(capture, captures / name)
+    (captures / "System Volume Information").mkdir()
+    stat = Path.stat
+
+    def refuse(path, **options):
+        if path.parent.name == "System Volume Information" or path.is_relative_to(captures / "a" / "images"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return stat(path, **options)
+
+    monkeypatch.setattr(Path, "stat", refuse)
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    echo.write_text("""#!/bin/sh\necho '{"type": "error", "message": "Reached."}'\nexit 2\n""")
+    echo.chmod(0o755)
+    assert headless.main(["batch", str(captures), "--out", str(out), "--backend-python", str(echo)]) == 2
+    assert [entry["name"] for entry in summary(out).values()] == ["a", "b"]
+    assert "cannot be used (Permission denied)" in summary(out)["a"]["error"], capsys.readouterr()
+    assert summary(out)["b"]["error"] == "Reached."
+
+
+@pytest.mark.parametrize(
+    ("command", "option"), [("mesh", "--capture"), ("batch", "--groups"), ("import-splats", "--capture")]
+)
+def test_relative_paths_are_those_of_the_working_folder(capture, tmp_path, monkeypatch, command, option):
+    shutil.copytree(capture, tmp_path / "captures" / "one")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    python = tmp_path / "python"
+    python.write_text(f"""#!/bin/sh\necho "$@" >> '{tmp_path / "called"}'\nexit 1\n""")
+    python.chmod(0o755)
+    out = [] if command == "mesh" else ["--out", "out"]
+    assert headless.main([command, "captures", *out, option, "../moved", "--backend-python", str(python)]) == 1
+    words = (tmp_path / "called").read_text().split()
+    assert words[words.index(option) + 1] == str(tmp_path.parent / "moved")
+
+
+def test_characters_that_the_output_lacks_are_escaped(tmp_path):
+    python = tmp_path / "python"
+    event = json.dumps({"type": "status", "message": "Reading \u82b1"}).replace("\\", "\\\\")
+    python.write_text(f"""#!/bin/sh\nprintf '{event}\\n{{"type": "done"}}\\n'\n""")
+    python.chmod(0o755)
+    ran = run("mesh", tmp_path, "--backend-python", python, PYTHONIOENCODING="ascii")
+    assert ran.returncode == 0 and "Reading \\u82b1" in ran.output, ran.output + ran.errors
 
 
 def test_batch_rejects_invalid_arguments(tmp_path):
