@@ -34,10 +34,11 @@ def preferences() -> Any:
 
 
 def user_folder() -> Path:
-    """Return the folder for files that survive updates of the extension; create it if needed."""
+    """Return the folder for files that survive updates of the extension; it may be missing."""
+    # Where Blender was to create it and could not, the path would be empty, which means the working folder.
     if PACKAGE.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(PACKAGE, create=True))
-    return Path(bpy.utils.user_resource("DATAFILES", path="objectgs", create=True))
+        return Path(bpy.utils.extension_path_user(PACKAGE))
+    return Path(bpy.utils.user_resource("DATAFILES", path="objectgs"))
 
 
 def environment_folder() -> Path:

@@ -57,6 +57,16 @@ def test_second_process_gets_pid_of_holder(tmp_path, holder):
     assert lock_holder(tmp_path) == holder.pid
 
 
+@pytest.mark.skipif(os.name != "posix", reason="permissions of POSIX")
+def test_other_users_of_a_group_can_take_a_lock_over(tmp_path):
+    before = os.umask(0o002)
+    try:
+        with locked(tmp_path):
+            assert (tmp_path / lock.NAME).stat().st_mode & 0o777 == 0o664
+    finally:
+        os.umask(before)
+
+
 def test_lock_of_killed_process_is_released(tmp_path, holder):
     os.kill(holder.pid, signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
     holder.wait()

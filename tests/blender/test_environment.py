@@ -541,6 +541,29 @@ def test_download_of_a_local_version_is_found(root):
     assert shown == ["Downloading torch (2000.0 MB)", pytest.approx(0.25 * 2 / 3)]
 
 
+def test_download_that_vanishes_does_not_end_the_setup(root, monkeypatch):
+    """As when pip deletes its temporary folder while it is searched."""
+    shown = []
+    progress = SimpleNamespace(status=shown.append, at=shown.append)
+    installer = pip.Pip(Path(sys.executable), root, root, progress, lambda: False)
+    installer._downloaded, installer._file, installer._file_size, installer._installing = 0.0, "torch.whl", 100.0, []
+
+    def vanished(_folder, _pattern):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(pip.Path, "rglob", vanished)
+    installer._tick(megabytes=500)
+    assert shown == [0.0]
+
+
+def test_environment_that_python_cannot_make_is_explained(root, monkeypatch):
+    monkeypatch.setattr(setup, "guarded", lambda *_: [sys.executable, "-c", "raise SystemExit('No space left.')"])
+    options = argparse.Namespace(folder=root / "environment", device="cpu", requirements=root / "requirements")
+    with pytest.raises(events.Refused, match=r"could not make an environment in .* \(No space left\); make sure"):
+        setup.set_up(options, lambda: False)
+    assert not options.folder.exists()
+
+
 def test_crash_is_named_by_its_first_line():
     output = checks._DoctorOutput(SimpleNamespace())
     for line in (

@@ -239,6 +239,19 @@ def test_unsuitable_python_is_reported(extension, monkeypatch, capture, tmp_path
     assert blocks() == before and not (tmp_path / "out").exists()
 
 
+def test_user_folder_that_cannot_be_made_is_not_the_working_folder(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("BLENDER_USER_DATAFILES", str(tmp_path / "file"))
+    monkeypatch.setenv("BLENDER_USER_EXTENSIONS", str(tmp_path / "file"))
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    monkeypatch.chdir(tmp_path)
+    assert locations.user_folder() == tmp_path / "file" / "objectgs"
+    monkeypatch.setattr(locations, "PACKAGE", "bl_ext.user_default.objectgs")
+    assert locations.user_folder() == tmp_path / "file" / ".user" / "user_default" / "objectgs"
+    assert "is not set up" in locations.backend_sentence()
+    assert os.listdir(tmp_path) == ["file"]
+
+
 def test_python_without_packages_is_reported(extension, monkeypatch, capture, tmp_path):
     """The Python of these tests has only bpy and NumPy."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)

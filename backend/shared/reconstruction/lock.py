@@ -85,7 +85,8 @@ def lock_holder(folder: Path) -> int | None:
 
 def _acquire(path: Path) -> int | None:
     """Return a descriptor of the locked file, or None if the lock is held elsewhere."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    # As the process's umask allows, since a file that a killed process leaves may be met by another user of a group.
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     # The previous holder deletes the file, and a lock on a deleted file excludes no other process.
     if _try_lock(descriptor) and _is_same_file(path, descriptor):
         return descriptor

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -124,12 +125,15 @@ class Pip:
             fraction = (len(self._installed()) - self._before) / len(self._installing)
             self.progress.at((2 + fraction) / 3)
         elif self._file:
-            received = max((path.stat().st_size for path in self._partial()), default=0) / 1e6
+            received = self._received() / 1e6
             total = max(megabytes, self._downloaded + self._file_size)
             self.progress.at((self._downloaded + min(received, self._file_size)) / total * 2 / 3)
 
-    def _partial(self) -> list[Path]:
-        return [path for path in self.temporary.rglob(self._file) if path.is_file()]
+    def _received(self) -> int:
+        """Return the size of the file that is being downloaded, 0 while pip moves or deletes it."""
+        with contextlib.suppress(OSError):
+            return max((path.stat().st_size for path in self.temporary.rglob(self._file) if path.is_file()), default=0)
+        return 0
 
     def _installed(self) -> list[Path]:
         return [path for path in self.site.iterdir() if path.name.endswith(".dist-info")]

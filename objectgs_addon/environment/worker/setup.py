@@ -60,10 +60,20 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
             "kernels": ("Compiling kernels", KERNEL_SECONDS),
         }
     )
+    said: list[str] = []
+
+    def print_and_keep(line: str) -> None:
+        print_error(line)
+        said.append(line)
+
     with claimed(folder), layout.short_path(folder) as short:
         progress.begin("venv", "Making an environment")
-        if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_error) != 0:
-            raise Refused(f"{sys.executable} could not make an environment in {folder}; choose another Python.")
+        if run(guarded(Path(sys.executable), "venv", str(short / layout.VENV)), stop, print_and_keep) != 0:
+            why = f" ({said[-1].rstrip('.')})" if said else ""
+            raise Refused(
+                f"{sys.executable} could not make an environment in {folder}{why}; make sure that files can be written "
+                "there, or choose another Python."
+            )
         pip = Pip.of_environment(short, progress, stop)
         progress.begin("packages", "Resolving the packages")
         chosen = choose(pip, options.requirements, device, layout.GIGABYTES["cuda"])
