@@ -50,15 +50,16 @@ def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
     if len(known) < 2:
         return gains
     count = len(capture.points.xyz)
+    # Those of all views at once, since each view observes only some of the points.
+    all_points = np.concatenate([observed[i][0] for i in known])
+    all_colors = np.concatenate([observed[i][1] for i in known])
+    views = np.repeat(known, [len(observed[i][0]) for i in known])
+    seen = np.bincount(all_points, minlength=count)
     for _ in range(_ROUNDS):
         check()
-        total, seen = np.zeros((count, 3)), np.zeros(count)
-        for i in known:
-            points, colors = observed[i]
-            for c in range(3):
-                total[:, c] += np.bincount(points, colors[:, c] / gains[i, c], minlength=count)
-            seen += np.bincount(points, minlength=count)
-        mean = total / np.maximum(seen, 1)[:, None]
+        compensated = all_colors / gains[views]
+        total = [np.bincount(all_points, compensated[:, c], minlength=count) for c in range(3)]
+        mean = np.stack(total, 1) / np.maximum(seen, 1)[:, None]
         for i in known:
             points, colors = observed[i]
             shared = seen[points] > 1
