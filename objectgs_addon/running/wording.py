@@ -29,7 +29,7 @@ _PHRASES = {
     "try a smaller --max-size, --memory-mb or --max-anchors": "close other programs, or use a smaller Image Size",
     "a smaller --max-size or --max-anchors, or --device cpu": "a smaller Image Size",
     "a smaller --max-size or --max-anchors": "a smaller Image Size",
-    "close other programs or lower --memory-mb": "close other programs",
+    "or use a smaller --memory-mb or --max-size": "or use a smaller Image Size",
     "--objects given keeps the IDs": "choose As Given for Objects to keep the IDs",
     "or use `masks`": "or use Import Masks",
     "which --text and --detector are for": "which Names is for",

@@ -1,5 +1,6 @@
 """Losses against autograd, growth rules, checkpoints, and whole trainings on tiny captures."""
 
+import copy
 import dataclasses
 import math
 import signal
@@ -829,6 +830,11 @@ def test_training_that_may_take_more_memory_than_is_free_says_what_fits(tiny, mo
     roomy = Trainer.start(capture, ids, Settings(offsets=4, max_anchors=fits))
     memory.warn_of_memory(roomy, 2000, reporter)
     assert len(warnings) == 1, "what is said to fit does"
+    photos = tuple(dataclasses.replace(view, width=6000, height=4000) for view in capture.views)
+    roomy.scene.capture = copy.copy(capture)
+    roomy.scene.capture.views = photos
+    memory.warn_of_memory(roomy, 2000, reporter)
+    assert warnings.pop() and len(warnings) == 1, "large photos take memory, too"
     trainer.progress.step = 5
     memory.warn_of_memory(trainer, 2000, reporter)
     assert f"--restart with --max-anchors {fits}" in warnings[1], "a training goes on with the same settings"

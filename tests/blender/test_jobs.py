@@ -564,6 +564,9 @@ def test_sentences_have_the_names_that_blender_shows():
     )
     no_model = "a has no model, which --text and --detector are for; choose a folder with one as MASKS."
     assert in_blender(no_model) == "a has no model, which Names is for; clear Names, or choose a folder with one."
+    assert in_blender("It may take 9 GB; close other programs, or use a smaller --memory-mb or --max-size.") == (
+        "It may take 9 GB; close other programs, or use a smaller Image Size."
+    )
     assert in_blender("The GPU failed; `doctor` tests the GPU.") == "The GPU failed; Check Backend tests the GPU."
     assert in_blender("It has another plan; use the same --keep and --leave-out, or --restart to start over.") == (
         "It has another plan; set the check boxes of the panel Plan as they were, or Retrain to start over."

@@ -11,7 +11,10 @@ from ...training.trainer import Trainer
 from ..setup.machine import free_memory
 
 _BASE = 0.7e9
-"""Bytes of a training without a model: packages, kernels, and one view at a time."""
+"""Bytes of a training without a model and views: packages and kernels."""
+
+_A_PIXEL = 180
+"""Bytes of a pixel of the view that a step draws: the planes of the render and of its loss, and their gradients."""
 
 _COPIES = 5
 """Arrays with the size of the anchors' rows: the rows, two moments, their mean, and one that growth replaces."""
@@ -49,7 +52,8 @@ def warn_of_memory(trainer: Trainer, memory_mb: float, reporter: Reporter) -> No
     views = capture.train_indices[:: -(-len(capture.train_indices) // _VIEWS)]
     counts = [len(anchors_in_view(anchors, *frustum(trainer.scene.camera(index)))) for index in views]
     each = bytes_per_anchor(anchors.layout, max(counts) / len(anchors))
-    trained, rest = len(anchors) - fixed, _BASE + memory_mb * 1e6 + fixed * each
+    pixels = max(capture.views[index].width * capture.views[index].height for index in capture.train_indices)
+    trained, rest = len(anchors) - fixed, _BASE + _A_PIXEL * pixels + memory_mb * 1e6 + fixed * each
     most, free = max(trainer.settings.max_anchors, trained), free_memory() / processes_here()
     if rest + most * each <= free:
         return
@@ -57,7 +61,7 @@ def warn_of_memory(trainer: Trainer, memory_mb: float, reporter: Reporter) -> No
     of_cell = not trainer.region.is_whole
     # Those with which a cell begins are not thinned out.
     if fits < (max(trained, _ROUNDING) if of_cell else _ROUNDING):
-        advice = "close other programs or lower --memory-mb"
+        advice = "close other programs, or use a smaller --memory-mb or --max-size"
     else:
         advice = f"{'--restart with ' if trainer.progress.step else ''}--max-anchors {fits} fits"
     otherwise = (
