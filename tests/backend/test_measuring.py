@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from backend.commands.training import measuring
 from backend.commands.training.measuring import SHARE, Measuring
@@ -72,6 +73,17 @@ def test_end_and_deciding_views_are_always_measured(clock, tmp_path):
     assert set(figures) == {"validation_psnr"} and clock.drawn == [0, 7, 8]
     figures = measure(None, scene(), TrainingProgress(step=10))
     assert figures["psnr"] > 0 and clock.drawn[3:] == list(HELD_OUT)
+
+
+def test_preview_of_a_training_view_has_no_object_for_unknown_pixels(clock, tmp_path, monkeypatch):
+    without = scene()
+    without.capture.test_indices = ()
+    without.capture.mask = lambda index: np.array([[-1, 0, 1, 1]] * 6).repeat(2, 1)
+    masks = []
+    monkeypatch.setattr(measuring, "comparison", lambda *images: masks.append(images[2]) or Image.new("RGB", (8, 6)))
+    measure = Measuring(SimpleNamespace(previews=tmp_path), Budget(steps=10), Reporter())
+    assert measure(None, without, TrainingProgress(step=10))["psnr"] is None
+    assert np.unique(masks).tolist() == [0, 1]
 
 
 def test_latest_figures_are_those_of_the_latest_measured_entry(tmp_path):

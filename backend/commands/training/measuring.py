@@ -76,7 +76,9 @@ class Measuring:
                     ids.add(rendered.ids, truth)
             if number == 0:
                 assert rendered.ids is not None
-                preview = comparison(photo, rendered.image, truth, rendered.ids, None, capture.names)
+                # Where no view is held out, it is a training view, whose corrected mask has pixels without an ID.
+                shown = None if truth is None else np.maximum(truth, 0)
+                preview = comparison(photo, rendered.image, shown, rendered.ids, None, capture.names)
                 render = save_image(thumbnail(rendered.image), self._folder.previews / "render.png", quick=True)
                 latest = save_image(preview, self._folder.previews / "latest.png", quick=True)
                 self._reporter.preview(latest, render=render)
