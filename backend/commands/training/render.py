@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,8 +46,9 @@ def render(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 def _render_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the path of each view's render: its name with .png; names that differ only in the suffix keep it."""
     paths = [folder / Path(name).with_suffix(".png") for name in names]
+    count = Counter(paths)
     return [
-        path if paths.count(path) == 1 else path.with_name(Path(name).name + ".png")
+        path if count[path] == 1 else path.with_name(Path(name).name + ".png")
         for path, name in zip(paths, names, strict=True)
     ]
 
