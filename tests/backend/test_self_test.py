@@ -120,7 +120,9 @@ def test_a_gpu_is_tested_once(with_gpu, monkeypatch):
 def test_a_gpu_with_other_results_is_not_used(with_gpu):
     choose = with_gpu('print(\'{"problem": "the losses of discs differ by 7.0%"}\')')
     failure = "cuda (Card) fails a test (the losses of discs differ by 7.0%)"
-    warning = f"Warning: {failure}, so the CPU is used; a newer driver of the GPU may help, and `doctor` tests it again."
+    warning = (
+        f"Warning: {failure}, so the CPU is used; a newer driver of the GPU may help, and `doctor` tests it again."
+    )
     assert choose() == (devices.CPU, ["Testing cuda (Card), once", warning])
     assert choose() == (devices.CPU, [warning]) and choose.runs() == 1
     with pytest.raises(InputError) as error:

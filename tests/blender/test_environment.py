@@ -610,6 +610,16 @@ def make(folder, text):
         (folder / layout.MARKER).write_text(text)
 
 
+def stop(folder):
+    """Stop while an environment is being made."""
+    with setup.claimed(folder):
+        assert not (folder / "venv").exists()
+        for name in ("venv", "tmp"):
+            (folder / name).mkdir()
+        (folder / "ready.json.part").touch()
+        raise events.Stopped
+
+
 def assert_complete(folder, text):
     assert sorted(path.name for path in folder.iterdir()) == [layout.STAMP, layout.MARKER, "venv"]
     assert (folder / layout.MARKER).read_text() == text
@@ -619,11 +629,8 @@ def assert_complete(folder, text):
 def test_failed_setup_puts_earlier_environment_back(root):
     folder = root / "environment"
     make(folder, "first")
-    with pytest.raises(events.Stopped), setup.claimed(folder):
-        for name in ("venv", "tmp"):
-            (folder / name).mkdir()
-        (folder / "ready.json.part").touch()
-        raise events.Stopped
+    with pytest.raises(events.Stopped):
+        stop(folder)
     assert_complete(folder, "first")
     make(folder, "second")
     assert_complete(folder, "second")
@@ -635,9 +642,8 @@ def test_environment_survives_killed_setup(root):
     setup._put_aside(folder)
     (folder / "venv" / "leftover").mkdir(parents=True)
     assert environment.inspect(folder).state == "incomplete"
-    with pytest.raises(ZeroDivisionError), setup.claimed(folder):
-        assert not (folder / "venv").exists()
-        raise ZeroDivisionError
+    with pytest.raises(events.Stopped):
+        stop(folder)
     assert_complete(folder, "first")
     setup._put_aside(folder)
     environment.remove(folder)

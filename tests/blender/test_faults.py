@@ -249,7 +249,7 @@ def test_user_folder_that_cannot_be_made_is_not_the_working_folder(tmp_path, mon
     monkeypatch.setattr(locations, "PACKAGE", "bl_ext.user_default.objectgs")
     assert locations.user_folder() == tmp_path / "file" / ".user" / "user_default" / "objectgs"
     assert "is not set up" in locations.backend_sentence()
-    assert os.listdir(tmp_path) == ["file"]
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_python_without_packages_is_reported(extension, monkeypatch, capture, tmp_path):

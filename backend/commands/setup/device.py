@@ -70,7 +70,9 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
         return device
     failure = f"{devices.name_of(device)} fails a test ({problem})"
     if requested == "cuda":
-        raise InputError(f"{failure}; choose --device cpu, or install a newer driver of the GPU; `doctor` tests it again.")
+        raise InputError(
+            f"{failure}; choose --device cpu, or install a newer driver of the GPU; `doctor` tests it again."
+        )
     reporter.warning(f"{failure}, so the CPU is used; a newer driver of the GPU may help, and `doctor` tests it again.")
     return devices.CPU
 
