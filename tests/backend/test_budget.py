@@ -241,11 +241,12 @@ def test_time_limit_holds_where_the_last_steps_are_slower():
     """As they are where images are not reduced any more."""
     budget, p = (
         Budget(seconds=100.0, until_converged=True),
-        TrainingProgress(step=1000, seconds=90.0, converged_at=1000),
+        TrainingProgress(step=1000, seconds=100 * DECAY_FROM, converged_at=1000),
     )
     assert budget.progress(p) < 0.81
-    p.step, p.seconds = 1020, 95.0
-    assert budget.progress(p) == pytest.approx(0.9) and budget.remaining(p, 0.25) == pytest.approx(5.0)
+    p.step, p.seconds = 1020, 50 * (1 + DECAY_FROM)
+    assert budget.progress(p) == pytest.approx(0.9)
+    assert budget.remaining(p, 0.25) == pytest.approx(50 * (1 - DECAY_FROM))
     p.seconds = 100.0
     assert budget.progress(p) == 1.0
 

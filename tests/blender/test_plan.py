@@ -124,7 +124,7 @@ def test_headless_passes_absolute_group_paths(monkeypatch, tmp_path):
     commands.plan(parse(["plan", "garden", "--no-meshes"]))
     commands.plan(parse(["plan", "garden", "--out", "made", "--groups", "g.json", "--keep", "all"]))
     commands.backend(parse(["vote", "garden", "--out", "made", "--groups", "g.json"]))
-    garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", tmp_path / "g.json")
+    garden, made, groups = tmp_path / "garden", tmp_path / "made", ("--groups", str(tmp_path / "g.json"))
     assert calls == [
         ("plan", None, garden, "--no-meshes"),
         ("plan", made, garden, "--out", made, *groups, "--keep", "all"),

@@ -61,10 +61,10 @@ def parse_json(text: str | bytes) -> Any:
     return value
 
 
-def read_json(path: Path, largest: int = LARGEST) -> Any:
+def read_json(path: Path, largest: int | None = None) -> Any:
     """Read a JSON file of up to `largest` bytes; raise InputError that names the file if it is missing or invalid."""
     try:
-        return parse_json(read_regular(path, largest).decode("utf-8"))
+        return parse_json(read_regular(path, largest or LARGEST).decode("utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path} does not exist; run the step that creates it first.") from error
     except (OSError, ValueError) as error:
