@@ -26,7 +26,7 @@ WARM_UP = 600
 plateau. During the warm-up, the error decreases faster than later. Earlier growth would result in more anchors, but no
 better quality."""
 
-LOOKAHEAD, WORTHWHILE_DB = 1000, 0.36
+LOOKAHEAD, WORTHWHILE_DB = 1000, 0.2
 """A training has converged when this number of further steps would gain less than this number of dB."""
 
 OCTAVES, MIN_OCTAVES = 2, 1.25
