@@ -235,9 +235,10 @@ class Capture:
         """
         if self._correct is None or index not in self._corrected:
             return self.uncorrected_mask(index, downscale)
-        # The cache is shared with captures that have other corrections, or none.
-        ids = self._cache.get((self._correct, index, downscale), lambda: self._corrected_mask(index, downscale))
-        return self.without_left_out(ids)
+        # The cache is shared with captures that have other corrections, or none. A correction takes long, so that masks
+        # of all sizes are of the same.
+        ids = self._cache.get((self._correct, index), lambda: self._corrected_mask(index))
+        return self.without_left_out(self._reduced(ids, index, downscale).astype(np.int64))
 
     def uncorrected_mask(self, index: int, downscale: int = 1) -> np.ndarray | None:
         """Return a view's ID map as in its file, in the form of `mask`."""
@@ -311,10 +312,13 @@ class Capture:
         self._check_unchanged(index, path, (ids.shape[1], ids.shape[0]))
         return self._reduced(ids, index, downscale)
 
-    def _corrected_mask(self, index: int, downscale: int) -> np.ndarray:
+    def _corrected_mask(self, index: int) -> np.ndarray:
+        """Return the corrected mask in the smallest type that holds its IDs."""
         mask = self.uncorrected_mask(index)
         assert mask is not None and self._correct is not None
-        return self._reduced(self._correct(index, mask), index, downscale)
+        ids = self._correct(index, mask)
+        bounds = (np.min_scalar_type(int(each)) for each in (ids.min(initial=0), ids.max(initial=0)))
+        return ids.astype(np.result_type(*bounds))
 
     def _reduced(self, ids: np.ndarray, index: int, downscale: int) -> np.ndarray:
         """Return the IDs at the centers of blocks of downscale x downscale pixels."""

@@ -67,6 +67,21 @@ def test_exchanged_ids_are_exchanged_back(scene, tmp_path):
             assert np.array_equal(corrected.mask(other), capture.mask(other))
 
 
+def test_masks_of_all_sizes_are_corrected_once(scene, tmp_path):
+    capture, _ = loaded(scene, tmp_path)
+    calls = []
+
+    def correct(index, mask):
+        calls.append(index)
+        return np.where(mask == FIRST, IGNORED, 70_000)
+
+    corrected = capture.with_corrected_masks(frozenset({3}), correct)
+    whole, half = corrected.mask(3), corrected.mask(3, 2)
+    assert calls == [3] and whole.dtype == half.dtype == np.int64
+    assert np.array_equal(whole, np.where(capture.mask(3) == FIRST, IGNORED, 70_000))
+    assert np.array_equal(half, whole[1::2, 1::2])
+
+
 def test_flooded_background_is_ignored(scene, tmp_path):
     """The second sphere is background; in one mask it has, with the rest, the ID of the third."""
     index = load_capture(scene.folder, tmp_path / "cache").train_indices[2]
