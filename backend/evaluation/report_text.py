@@ -119,7 +119,9 @@ def _of_validation(report: Report) -> str:
     if not count:
         return ""
     views = "1 other view was" if count == 1 else f"{count} other views were"
-    return f"{views} not trained on either until the training had converged, since their PSNR decided when it had. "
+    if report.capture.get("validation_joined"):
+        return f"{views} trained on in the last part alone, since their PSNR tells when that begins. "
+    return f"{views} used for validation instead of training: their PSNR tells when the training has converged. "
 
 
 def _of_unlabeled(report: Report) -> str:

@@ -78,7 +78,7 @@ class Region(NamedTuple):
 def correct_masks(
     capture: Capture, point_ids: np.ndarray, ignore_gaps: bool, check: Check = proceed
 ) -> tuple[Capture, int]:
-    """Correct the masks of training views where they contradict the votes.
+    """Correct the masks of training and validation views where they contradict the votes.
 
     Args:
         capture: the capture; must be prepared. Without the objects that are left out, it is corrected all the same.
@@ -88,14 +88,16 @@ def correct_masks(
         check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
-        The capture whose `mask` returns the corrected IDs of training views, IGNORED where none is known, and the
-        number of regions that are corrected. Held-out and validation views are unchanged.
+        The capture whose `mask` returns the corrected IDs of these views, IGNORED where none is known, and the number
+        of regions that are corrected. Held-out views are unchanged.
     """
+    # Validation views are trained on in the end.
+    views = (*capture.train_indices, *capture.validation_indices)
     wrong = {}
-    for index in capture.train_indices:
+    for index in views:
         check()
         wrong[index] = [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
-    shown_in = Counter(object_id for index in capture.train_indices for object_id in capture.ids_in(index))
+    shown_in = Counter(object_id for index in views for object_id in capture.ids_in(index))
     wrong_in = Counter(object_id for ids in wrong.values() for object_id in set(ids))
     kept = {object_id for object_id, views in wrong_in.items() if views > _MOSTLY_WRONG * shown_in[object_id]}
     wrong = {index: left for index, ids in wrong.items() if (left := [i for i in ids if i not in kept])}
@@ -111,7 +113,7 @@ def correct_masks(
         return result
 
     regions = sum(map(len, wrong.values()))
-    changed = {index for index in capture.train_indices if 0 in capture.ids_in(index)} if ignore_gaps else set()
+    changed = {index for index in views if 0 in capture.ids_in(index)} if ignore_gaps else set()
     changed |= set(wrong)
     return (capture.with_corrected_masks(frozenset(changed), correct) if changed else capture), regions
 

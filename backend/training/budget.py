@@ -42,9 +42,9 @@ VALIDATE_EVERY, MAX_VALIDATION_VIEWS, MIN_TRAINED_VIEWS = 8, 20, 16
 than the third number of views would be left to train on: the few that could be would cost the model more than they
 tell about it."""
 
-DECAY_FROM = 0.8
+DECAY_FROM, _DECAY_FROM_BEFORE = 0.8, 0.9
 """Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; after that, it
-trains on the validation views, too."""
+trains on the validation views, too. The second number is that of checkpoints of earlier versions."""
 
 
 @dataclass
@@ -59,7 +59,9 @@ class TrainingProgress:
         evaluated: for a training of known length, the number of evaluations so far; for a training until convergence,
             the step of the latest one.
         grown: whether growth has ended.
-        converged_at: step at which the training converged and the learning rate decay began; 0 before.
+        converged_at: step at which the plateau ended and the learning rate decay began; 0 before.
+        ends_at: step at which the decay ends; 0 before, and in checkpoints of earlier versions.
+        limited: whether the time limit has ended the plateau, before the training has converged.
         curve: for each evaluation, the seconds, step, number of anchors, loss (dB) and measured quality, on held-out
             views unless they are left for later, as `validation_psnr` on validation views, and as `watched_psnr` on
             those of `watched`. `objective` tells apart losses that do not compare.
@@ -81,19 +83,25 @@ class TrainingProgress:
     watched: list[int] = field(default_factory=list)
     dropped: float = 0.0
     joined: bool = False
+    ends_at: int = 0
+    limited: bool = False
 
     @property
     def latest(self) -> dict[str, Any]:
         """The latest entry of the curve with figures of held-out views, or an empty one."""
         return next((entry for entry in reversed(self.curve) if entry.get("psnr") is not None), {})
 
-    def join(self, validation: Sequence[int], rng: np.random.Generator) -> bool:
+    def join(self, validation: Sequence[int]) -> bool:
         """Train on the validation views first, and on all views from then on; return whether there are such views."""
         if self.joined or not validation:
             return False
         self.joined = True
-        self.queue += rng.permutation(validation).tolist()
+        self.queue += validation
         return True
+
+    def resume_plateau(self) -> None:
+        """Go on as if the plateau had not ended: the validation views decide again."""
+        self.converged_at, self.ends_at, self.limited, self.joined = 0, 0, False, False
 
     @property
     def causes(self) -> str:
@@ -130,7 +138,7 @@ class Budget:
                 return PLATEAU_FROM * p.step / WARM_UP
             if not p.converged_at:
                 return (GROW_UNTIL + (PLATEAU_UNTIL if p.grown else PLATEAU_FROM)) / 2
-            decay = (p.step - p.converged_at) / (p.converged_at / DECAY_FROM - p.converged_at)
+            decay = (p.step - p.converged_at) / (end_of_decay(p) - p.converged_at)
             if self.seconds is not None:
                 # Steps take longer from here on, where images are not reduced any more.
                 begin = max(DECAY_FROM * self.seconds, _seconds_at(p, p.converged_at))
@@ -181,9 +189,8 @@ class Budget:
         if self.until_converged:
             # Stops must not delay evaluations, which decide when the training ends.
             p.evaluated = int(p.curve[-1]["step"]) if p.curve else 0
-            if p.converged_at and not has_converged(p) and not self._is_limited(p):
-                # An earlier, smaller limit has ended the plateau.
-                p.converged_at = 0
+            if p.limited and not self._is_limited(p):
+                p.resume_plateau()
         else:
             p.evaluated = bisect_right(_EVALUATIONS, self.progress(p))
 
@@ -210,9 +217,11 @@ class Budget:
         if not self.until_converged or p.converged_at:
             return False
         p.grown = p.grown or _growth_has_ceased(p.curve)
-        if not self._out_of_time(p) and not has_converged(p):
+        converged = convergence_step(p.curve)
+        has_converged = converged is not None and p.step >= max(converged, WARM_UP)
+        if not self._out_of_time(p) and not has_converged:
             return False
-        p.converged_at = p.step
+        p.converged_at, p.ends_at, p.limited = p.step, math.ceil(p.step / DECAY_FROM), not has_converged
         return True
 
     def _out_of_time(self, p: TrainingProgress) -> bool:
@@ -231,15 +240,13 @@ def objective_of(p: TrainingProgress, downscale: int) -> str:
 
 def plateau_end(p: TrainingProgress) -> str:
     """Return a sentence without a period on why the plateau of a training until convergence has ended."""
-    why = "The training has converged" if has_converged(p) else "The time limit is near"
+    why = "The time limit is near" if p.limited else "The training has converged"
     return f"{why}; its learning rates fall from step {p.converged_at:,} on"
 
 
-def has_converged(p: TrainingProgress) -> bool:
-    """Return whether the measurements so far, or those until the plateau ended, say that the training has converged."""
-    step = p.converged_at or p.step
-    converged = convergence_step([entry for entry in p.curve if entry["step"] <= step])
-    return converged is not None and step >= max(converged, WARM_UP)
+def end_of_decay(p: TrainingProgress) -> float:
+    """Return the step at which the learning rates end to fall, of a training whose plateau has ended."""
+    return p.ends_at or p.converged_at / _DECAY_FROM_BEFORE
 
 
 def _seconds_at(p: TrainingProgress, step: int) -> float:
@@ -264,7 +271,7 @@ def choose_validation_views(training: Sequence[int]) -> list[int]:
 def expected_end(p: TrainingProgress) -> float | None:
     """Estimate the total number of steps of a training until convergence; None as long as there is no estimate."""
     if p.converged_at:
-        return p.converged_at / DECAY_FROM
+        return end_of_decay(p)
     converged = convergence_step(p.curve)
     return None if converged is None else max(converged, p.step) / DECAY_FROM
 

@@ -273,7 +273,7 @@ class Trainer:
                 self._evaluate(evaluate, reporter, float(smooth), budget.progress(p))
                 if budget.check_convergence(p):
                     reporter.status(plateau_end(p))
-                    if p.join(capture.validation_indices, self.rng):
+                    if p.join(capture.validation_indices):
                         begin_colors(self.view_step.colors, self.shown, self.scene)
                 if overfitting.watch(p, budget):
                     reporter.status(overfitting.OVERFITS)

@@ -86,7 +86,6 @@ def test_losses_of_other_objectives_do_not_count():
     before = [{"step": s, "loss_db": 10 + 2 * math.log2(s), "objective": "a"} for s in steps]
     after = [{**entry, "loss_db": entry["loss_db"] - 3, "objective": "b"} for entry in before]
     joined = [entry for entry in before if entry["step"] < 1200] + [entry for entry in after if entry["step"] >= 1200]
-    assert convergence_step(joined[: 1 + len([s for s in steps if s < 1200])]) is None
     assert convergence_step(joined[:-5]) is None, "too few of the same objective"
     longer = range(WARM_UP, 16 * WARM_UP, 100)
     settled = [{"step": s, "loss_db": 2 * math.log2(s) - 3 * (s >= 1200), "objective": s >= 1200} for s in longer]
@@ -99,19 +98,23 @@ def test_greater_time_limit_continues_the_plateau():
     assert p.converged_at and limited.progress(p) == 1 and plateau_end(p).startswith("The time limit is near")
     limited.begin(p)
     assert p.converged_at, "the same limit"
+    p.joined = True
     longer.begin(p)
-    assert not p.converged_at and longer.progress(p) < PLATEAU_UNTIL
+    assert not p.converged_at and not p.joined and longer.progress(p) < PLATEAU_UNTIL
     done = walk(PRESETS["final"], lambda step: 30.0)
     assert plateau_end(done).startswith("The training has converged")
     PRESETS["final"].begin(done)
     assert done.converged_at
+    earlier = TrainingProgress(step=2000, converged_at=1800)
+    PRESETS["final"].begin(earlier)
+    assert PRESETS["final"].progress(earlier) == 1, "what an earlier version has ended stays so"
 
 
 def test_validation_views_join_once():
-    p, rng = TrainingProgress(queue=[1, 2]), np.random.default_rng(0)
-    assert not p.join((), rng) and not p.joined
-    assert p.join((7, 8, 9), rng) and p.queue[:2] == [1, 2] and sorted(p.queue[2:]) == [7, 8, 9]
-    assert not p.join((7, 8, 9), rng) and len(p.queue) == 5
+    p = TrainingProgress(queue=[1, 2])
+    assert not p.join(()) and not p.joined
+    assert p.join((7, 8, 9)) and p.queue == [1, 2, 7, 8, 9]
+    assert not p.join((7, 8, 9)) and len(p.queue) == 5
 
 
 def test_stops_do_not_delay_the_end_of_a_training_until_convergence():
@@ -241,7 +244,7 @@ def test_time_limit_holds_where_the_last_steps_are_slower():
     """As they are where images are not reduced any more."""
     budget, p = (
         Budget(seconds=100.0, until_converged=True),
-        TrainingProgress(step=1000, seconds=100 * DECAY_FROM, converged_at=1000),
+        TrainingProgress(step=1000, seconds=100 * DECAY_FROM, converged_at=1000, ends_at=1250),
     )
     assert budget.progress(p) < 0.81
     p.step, p.seconds = 1020, 50 * (1 + DECAY_FROM)
@@ -259,8 +262,8 @@ def test_remaining_time_is_estimated_from_curve():
     end = converged_after(1.0) / DECAY_FROM
     assert final.remaining(p, 0.05) == pytest.approx((end - 1000) * 0.05)
     assert final.displayed_progress(p) == pytest.approx(1000 / end)
-    p.converged_at = 960
-    assert final.remaining(p, 0.05) == pytest.approx((960 / DECAY_FROM - 1000) * 0.05)
+    p.converged_at, p.ends_at = 960, 1200
+    assert final.remaining(p, 0.05) == pytest.approx((1200 - 1000) * 0.05)
     falling = TrainingProgress(step=2000, curve=curve_of(range(WARM_UP, 2000, 100), lambda step: -step))
     assert final.remaining(falling, 0.05) == pytest.approx((2000 / DECAY_FROM - 2000) * 0.05)
     assert final.displayed_progress(falling) == DECAY_FROM

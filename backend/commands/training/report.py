@@ -56,7 +56,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     value = Report(
         capture={
             "folder": capture.folder.name, "views": len(capture.views), "held_out": len(capture.test_indices),
-            "validation": len(capture.validation_indices),
+            "validation": len(capture.validation_indices), "validation_joined": trained.progress.joined,
             "objects": len(capture.object_ids), **capture.counts,
             "exposure_varies": trained.scene.exposure_varies,
             "supervise_background": trained.scene.supervise_background,

@@ -90,6 +90,7 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
         trainer, plan = _begin(folder, capture, options, budget, reporter, device)
         output.accept()
         progress = trainer.progress
+        budget.begin(progress)
         if progress.step and budget.progress(progress) >= 1:
             reporter.status(
                 f"Already trained for {progress.step} steps in {progress.seconds:.0f} s; specify more --minutes or "

@@ -16,6 +16,7 @@ from ...capture.made_masks import is_made
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...capture.names import HELD_OUT, read_held_out, read_names
 from ...shared.errors import InputError
+from ...shared.events import Reporter
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.file_names import legible
 from ...shared.formats.photos_source import WORK
@@ -65,11 +66,18 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
                 shutil.copyfile(path, part)
 
 
-def remove_gone(capture: Path, stamps: Stamps) -> None:
-    """Remove the copies of masks that were removed beside the photos, unless others were made of them."""
-    if not is_made(capture / MASKS):
-        for name in stamps.forget_masks():
-            (capture / name).unlink(missing_ok=True)
+def warn_of_gone(capture: Path, stamps: Stamps, reporter: Reporter) -> None:
+    """Say which masks of the capture do not exist beside the photos any more, unless others were made of them.
+
+    They are not deleted, since the user may have changed them there.
+    """
+    gone = [name for name in stamps.masks_not_asked_for() if (capture / name).exists()]
+    if gone and not is_made(capture / MASKS):
+        count = "a mask" if len(gone) == 1 else f"{len(gone)} masks"
+        reporter.warning(
+            f"The original of {count} in {capture / MASKS} is gone, such as that of {Path(gone[0]).name}; delete the "
+            "copies, too, if they are wrong."
+        )
 
 
 def _is_missing(target: Path, path: Path, capture: Path, stamps: Stamps) -> bool:
@@ -124,7 +132,8 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
 
 def _require_readable(capture: Path, names: Sequence[str], unmasked: Sequence[str]) -> None:
     """Raise InputError for what would only be refused after hours, when the finished capture is read."""
-    if 2 * len(unmasked) > len(names) and not is_made(capture / MASKS):
+    # Those without a mask may get no pose, and then do not count.
+    if len(names) - len(unmasked) < 2 and not is_made(capture / MASKS):
         first = capture / MASKS / Path(unmasked[0]).with_suffix(".png")
         raise InputError(
             f"The mask {first} is missing, as are those of {len(unmasked)} of {len(names)} photos; add them."

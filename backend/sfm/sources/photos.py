@@ -20,7 +20,7 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StoppingReporter
 from .. import database
 from . import photo_files, video
-from .masks import copy_rest, remove_gone, write_masks
+from .masks import copy_rest, warn_of_gone, write_masks
 from .stamps import FILES, IMAGES, MASKS, Stamps
 
 FRAMES = "frames.json"
@@ -182,8 +182,8 @@ def take_photos(
     if are_beside:
         masks = MaskFiles(base, names, base)
         write_masks(masks, masks.photos, names, capture, stamps)
-    if has_masks and not in_place:
-        remove_gone(capture, stamps)
+    if not from_copies and not in_place:
+        warn_of_gone(capture, stamps, reporter)
     stamps.write()
     return Taken(photos, unreadable, not files)
 

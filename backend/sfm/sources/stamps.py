@@ -29,11 +29,9 @@ class Stamps:
         self._now[name] = [status.st_size, status.st_mtime_ns, *details]
         return name in self._known and self._known[name] != self._now[name]
 
-    def forget_masks(self) -> list[str]:
-        """Forget the masks that were not asked for, as they are gone, and return their paths in the capture."""
-        gone = [name for name in self._known.keys() - self._now.keys() if name.startswith(f"../{MASKS}/")]
-        for name in gone:
-            del self._known[name]
+    def masks_not_asked_for(self) -> list[str]:
+        """Return the paths in the capture of masks whose originals were not asked for, as they are gone."""
+        gone = sorted(name for name in self._known.keys() - self._now.keys() if name.startswith(f"../{MASKS}/"))
         return [name.removeprefix("../") for name in gone if PurePosixPath(name).parts.count("..") == 1]
 
     def write(self) -> None:

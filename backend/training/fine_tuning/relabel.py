@@ -68,8 +68,10 @@ def begin_with_labels(
     """
     tensors, state, _ = require_checkpoint(checkpoint)
     state = {**state, "supervise_background": supervise_background}
-    state["progress"] = {**state["progress"], "watched": [], "grown": False, "converged_at": 0}
-    return Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
+    state["progress"] = {**state["progress"], "watched": [], "grown": False}
+    trainer = Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
+    trainer.progress.resume_plateau()
+    return trainer
 
 
 def relabeled(
