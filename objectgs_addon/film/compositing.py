@@ -58,15 +58,22 @@ def set_up_compositor(
     node = _image_node(tree)
     if node is None:
         _join(scene, view_layer, tree, _load(folder, frames), matte)
-    elif _path(node.image).parent != folder:
+    elif (former := _path(node.image).parent) != folder and not _shows_elsewhere(scene, former):
         for other in scene.collection.children_recursive:
-            if kind_of(other) == RECONSTRUCTION and other.get(_FRAMES) == str(_path(node.image).parent):
+            if kind_of(other) == RECONSTRUCTION and other.get(_FRAMES) == str(former):
                 other.hide_render = False
     _use(tree, folder, frames)
     scene.render.use_compositing = True
     scene.render.film_transparent = True
     view_layer.use_pass_z = True
     root.hide_render, root[_FRAMES] = True, str(folder)
+
+
+def _shows_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
+    """Return whether the compositor of another scene shows frames of a folder."""
+    trees = (_tree_if_any(other) for other in bpy.data.scenes if other != scene)
+    nodes = (_image_node(tree) for tree in trees if tree is not None)
+    return any(node is not None and _path(node.image).parent == folder for node in nodes)
 
 
 def has_frames(scene: bpy.types.Scene) -> bool:

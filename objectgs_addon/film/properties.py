@@ -8,7 +8,7 @@ import bpy
 from bpy.props import BoolProperty, IntProperty, PointerProperty, StringProperty
 
 from ..environment import known_folders
-from ..scene.kinds import RECONSTRUCTION, kind_of
+from ..scene.kinds import RECONSTRUCTION, is_linked, kind_of
 
 SUBFRAMES = 9
 """Default number of sub-frames, odd so that one is at the middle of the exposure."""
@@ -27,7 +27,8 @@ class FilmProperties(bpy.types.PropertyGroup):
         name="Output",
         subtype="DIR_PATH",
         update=_folder_chosen,
-        description="Output folder of the film frames; if empty, the folder film in the reconstruction folder",
+        description="Output folder of the film frames; if empty, the folder film in the reconstruction folder. With "
+        "several reconstructions in the scene, each has a folder in it",
     )
     subframes: IntProperty(
         name="Sub-Frames",
@@ -42,20 +43,25 @@ class FilmProperties(bpy.types.PropertyGroup):
 def folder_of(scene: bpy.types.Scene, reconstruction: Path) -> Path:
     """Return the output folder of a reconstruction's film frames, by default `film` in the reconstruction folder.
 
-    In a scene with several reconstructions, each has a folder of its own in the output folder.
+    In a scene with several reconstructions that can be filmed, each has a folder of its own in the output folder.
     """
-    chosen = scene.objectgs_film.folder
-    if not chosen:
+    folder = _chosen_folder(scene)
+    if folder is None:
         return reconstruction / "film"
-    folder = Path(os.path.normpath(bpy.path.abspath(chosen)))
-    count = sum(kind_of(each) == RECONSTRUCTION for each in scene.collection.children_recursive)
+    count = sum(kind_of(each) == RECONSTRUCTION and not is_linked(each) for each in scene.collection.children_recursive)
     return folder / reconstruction.name if count > 1 else folder
+
+
+def _chosen_folder(scene: bpy.types.Scene) -> Path | None:
+    chosen = scene.objectgs_film.folder
+    return Path(os.path.normpath(bpy.path.abspath(chosen))) if chosen else None
 
 
 def is_accepted(scene: bpy.types.Scene, reconstruction: Path) -> bool:
     """Return whether film frames may be written to the output folder without asking the user."""
-    folder = folder_of(scene, reconstruction)
-    return known_folders.is_known(folder) or folder.is_relative_to(reconstruction)
+    folder, chosen = folder_of(scene, reconstruction), _chosen_folder(scene)
+    is_chosen = chosen is not None and known_folders.is_known(chosen)
+    return is_chosen or known_folders.is_known(folder) or folder.is_relative_to(reconstruction)
 
 
 def samples_of(scene: bpy.types.Scene, subframes: int = SUBFRAMES) -> int:

@@ -104,6 +104,7 @@ def add_object(root: bpy.types.Collection) -> Any:
             properties.active_marked = index
             return item
     used = {item.object_id for item in properties.marked} | {item.object_id for item in properties.objects}
+    used |= {int(stroke["merged"]) for stroke in strokes_of(root) if "merged" in stroke}
     object_id = next(number for number in range(1, len(used) + 2) if number not in used)
     item = _add_row(root, object_id)
     properties.active_marked = len(properties.marked) - 1

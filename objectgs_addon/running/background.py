@@ -345,8 +345,9 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
     edits = scene.shown_edits(root)
     if state.steps and edits is not None and edits.match:
         messages.show(
-            "Clean Up Labels gives splats the objects of the new masks; deleted and separated splats come back then",
-            operator="objectgs.clean_up_labels", label="Clean Up Labels",
+            f"Clean Up Labels gives the splats of {root.name} the objects of the new masks; deleted and separated "
+            "splats come back then",
+            operator="objectgs.clean_up_labels", label="Clean Up Labels", folder=str(job.folder),
         )  # fmt: skip
         return
     if state.trained:

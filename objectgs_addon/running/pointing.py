@@ -44,6 +44,7 @@ class _Session:
         self.problem, self.said, self.said_passes = "", "", False
         self.asked = self.answered = 0
         self.is_proposing = False
+        self.proposed_to_replace: dict[str, Any] = {}
         self._asked_strokes: list[dict[str, Any]] = []
         self._answered_strokes: list[dict[str, Any]] = []
         self.taken: tuple[int, int, float] | None = None
@@ -224,6 +225,7 @@ def propose(root: bpy.types.Collection) -> None:
     """Ask for objects without strokes, which replace those that are marked; starts the process if it does not run."""
     start(root)
     assert _session is not None
+    _session.proposed_to_replace = marks.content(root)
     _session.propose(root.objectgs.detail)
 
 
@@ -269,19 +271,27 @@ def share_of_splats() -> dict[int, int]:
 def refresh(root: bpy.types.Collection) -> None:
     """Ask for the objects of changed strokes, which may settle a problem of earlier ones."""
     if _session is not None and _session.root == root.session_uid:
+        content = marks.content(root)
+        is_proposing = _session.is_proposing or _session.wanted_detail is not None
+        if is_proposing and content == _session.proposed_to_replace:
+            # What was undone or set was something else.
+            return
         if _session.said_passes:
             _session.say("")
-        was_proposing = _session.is_proposing
-        _session.ask(marks.content(root))
-        if was_proposing:
-            _session.say("The marks have changed, so Suggest Objects was canceled; press it again", passes=True)
+        _session.wanted_detail = None
+        _session.ask(content)
+        if is_proposing:
+            _session.say("The marks have changed, so Suggest Objects was canceled; press it again")
         show()
 
 
 def recolor(root: bpy.types.Collection) -> None:
     """Show the colors of the marked objects if those have changed."""
-    if _session is not None and _session.root == root.session_uid and _session.colors != _colors(root, _session):
-        show()
+    if _session is not None and _session.root == root.session_uid:
+        colors = _colors(root, _session)
+        # Where other objects are listed, a new answer shows them.
+        if colors.keys() == _session.colors.keys() and colors != _session.colors:
+            show()
 
 
 def _colors(root: bpy.types.Collection, session: _Session) -> dict[int, tuple[float, ...]]:

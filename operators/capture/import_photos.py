@@ -20,7 +20,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
     bl_label = "Import Photos or Video"
     bl_description = (
         "Compute where the photos of a folder, the selected photos or the frames of a video were taken, in the "
-        "background, and import them. This takes minutes, and hours for hundreds of photos"
+        "background, and import them. This takes some minutes for tens of photos, and longer for hundreds"
     )
     bl_options = {"REGISTER"}
 

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Correct the masks and the splats' objects by the masks of all photos together."""
 
+from pathlib import Path
+
 import bpy
+from bpy.props import StringProperty
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import background
+from ...objectgs_addon.running import background, results
 from ..common import need
 from ..common.jobs import LOST_EDITS, STARTS_JOB, loses_splat_edits
 
@@ -19,12 +22,15 @@ class CleanUpLabels(bpy.types.Operator):
     )
     bl_options = STARTS_JOB
 
+    folder: StringProperty(options={"HIDDEN", "SKIP_SAVE"})
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.masked(cls, context)
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        if not loses_splat_edits(context):
+        # The message whose button names a reconstruction says what is lost.
+        if self.folder or not loses_splat_edits(context):
             return self.execute(context)
         return context.window_manager.invoke_confirm(
             self,
@@ -36,7 +42,8 @@ class CleanUpLabels(bpy.types.Operator):
         )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        root = need.active_root(context)
+        named = next(iter(results.roots_of(Path(self.folder))), None) if self.folder else None
+        root = named or need.active_root(context)
         folder = scene.folder_of(root)
         job = locations.backend_job(f"Labels of {root.name}", "label", folder, "clean-labels", str(folder))
         return background.submit(job, context.scene, self.report)

@@ -30,7 +30,7 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
             ("obj", "OBJ", "Materials and textures in files next to the file"),
         ],
     )
-    objects: objects_choice("Every object that has a mesh and is not removed")
+    objects: objects_choice("Every object that has a mesh and is not removed; if none has, the mesh of the whole scene")
     coordinates: EnumProperty(
         name="Coordinates",
         items=[

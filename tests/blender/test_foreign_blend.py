@@ -438,6 +438,11 @@ def test_an_output_folder_of_the_file_is_asked_about(root, folder, tmp_path, kno
     assert film.is_accepted(owner, folder), "the folder film in the reconstruction"
     owner.objectgs_film.folder = str(tmp_path / "frames")
     assert film.is_accepted(owner, folder), "the user has just chosen it"
+    second = bpy.data.collections.new("second")
+    owner.collection.children.link(second)
+    kinds.mark(second, "reconstruction")
+    assert film.folder_of(owner, folder).parent == tmp_path / "frames" and film.is_accepted(owner, folder)
+    bpy.data.collections.remove(second)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
     known.write_text(json.dumps({"folders": [str(folder)]}))
     opened(tmp_path / "film.blend")

@@ -275,7 +275,7 @@ def test_edits_of_splats_are_not_lost_without_a_question(root, monkeypatch, oper
     context = SimpleNamespace(scene=bpy.context.scene, window_manager=manager)
 
     def invoke():
-        return operator.invoke(SimpleNamespace(execute=lambda _: {"FINISHED"}), context, None)
+        return operator.invoke(SimpleNamespace(execute=lambda _: {"FINISHED"}, folder=""), context, None)
 
     assert invoke() == {"FINISHED"}
     edits = SplatEdits().delete(np.array([5, 7], np.uint64))
@@ -452,6 +452,33 @@ def test_marks_and_suggestions_do_not_cancel_each_other_silently(root, session, 
     count = len(told)
     marks.add_stroke(root, 1, views(root)[0], [(3, 3)], area=False)
     assert len(told) == count
+    pointing.propose(root)
+    pointing.refresh(root)
+    assert session.is_proposing and len(told) == count, "as after an undo of something else"
+    root.objectgs.everything = True
+    pointing.propose(root)
+    marks.clear(root)
+    assert not session.is_proposing and "Suggest Objects was canceled" in told[-1] == session.said
+
+
+def test_strokes_during_the_preparation_cancel_a_suggestion(root, session, monkeypatch):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
+    pointing.propose(root)
+    marks.add_stroke(root, marks.add_object(root).object_id, views(root)[0], [(1, 1)], area=False)
+    assert "Suggest Objects was canceled" in told[-1]
+    session.process.events = [{"type": "answer", "ready": True, "splats": len(session.keys)}]
+    pointing._tick()
+    assert session.process.sent[-1]["strokes"] == marks.strokes_of(root) and not session.is_proposing
+
+
+def test_new_objects_do_not_get_ids_of_merged_ones(root):
+    for _ in range(2):
+        item = marks.add_object(root)
+        marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1)], area=False)
+    known = {item.object_id for item in root.objectgs.marked}
+    marks.merge_object(root, 1, 0)
+    assert marks.add_object(root).object_id not in known
 
 
 def test_colors_of_marked_objects_are_shown_when_they_are_set(root, session, monkeypatch):

@@ -435,7 +435,7 @@ def test_scene_mesh_is_exported_where_no_object_has_one(fresh, folder, tmp_path)
     assert positions_in(tmp_path / "all.obj") == pytest.approx(coordinates(shown), abs=1e-4)
     (each,) = mesh_export.export(root, tmp_path / "each", "obj", None, True, False)
     assert each == tmp_path / "each" / "name_of_scene_mesh.obj" and each.is_file()
-    with pytest.raises(InputError, match="No chosen object has a mesh"):
+    with pytest.raises(InputError, match="choose All"):
         mesh_export.export(root, tmp_path / "one.obj", "obj", [1], False, False)
 
 

@@ -54,7 +54,8 @@ def check_space(folder: Path, device: str) -> None:
     existing = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     free, needed = shutil.disk_usage(existing).free / 1e9, layout.GIGABYTES[device]
     if free < needed:
-        advice = "use Remove Backend first, or make" if (folder / layout.MARKER).exists() else "make"
+        has_earlier = (folder / layout.MARKER).exists() or (folder / layout.OLD_MARKER).exists()
+        advice = "use Remove Backend first, or make" if has_earlier else "make"
         raise Refused(
             f"The backend needs about {needed:g} GB and the disk of {existing} has {free:.1f} GB free; {advice} "
             "room and try again."

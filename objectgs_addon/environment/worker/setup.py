@@ -186,6 +186,10 @@ def _put_aside(folder: Path) -> bool:
 
 def _put_back(folder: Path) -> None:
     """Restore the earlier environment that `_put_aside` has renamed."""
+    # Its removal may take long, and this process may be killed meanwhile.
+    with contextlib.suppress(OSError):
+        (folder / layout.TEMPORARY).mkdir(exist_ok=True)
+        os.replace(folder / layout.VENV, folder / layout.TEMPORARY / layout.VENV)  # noqa: PTH105
     layout.remove_folders([folder / layout.VENV])
     _replace(folder / layout.OLD, folder / layout.VENV)
     _replace(folder / layout.OLD_MARKER, folder / layout.MARKER)

@@ -61,6 +61,8 @@ def export(
     whole = scene.scene_meshes(root) if ids is None and not scene.object_meshes(root) else []
     whole = [mesh for mesh in whole if not mesh.hide_render] or whole
     if not chosen and not whole:
+        if not scene.object_meshes(root) and scene.scene_meshes(root):
+            raise InputError("The only meshes are of the whole scene or of sets of objects; choose All for Objects.")
         raise InputError(
             "No chosen object has a mesh, or all of them are removed; extract meshes, or choose other objects."
         )
@@ -166,11 +168,14 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                 # Exporters evaluate other frames.
                 obj.animation_data_clear()
                 obj.matrix_basis = Matrix(place.tolist())
-                if np.abs(np.array(obj.matrix_basis) - place).max() > _SHEARED * np.abs(place[:3, :3]).max():
+                difference = np.array(obj.matrix_basis)[:3, :3] - place[:3, :3]
+                if np.abs(difference).max() > _SHEARED * np.abs(place[:3, :3]).max():
                     # Location, rotation and scale cannot express shear.
                     obj.data = mesh.data.copy()
                     sheared.append(obj.data)
-                    obj.data.transform(Matrix(place.tolist()))
+                    obj.data.transform(Matrix(place.tolist()), shape_keys=True)
+                    if np.linalg.det(place[:3, :3]) < 0:
+                        obj.data.flip_normals()
                     obj.matrix_basis = Matrix()
                 obj.hide_viewport = obj.hide_render = False
                 stage.collection.objects.link(obj)
