@@ -27,7 +27,7 @@ BLURRED = (11, 30)
 """Photos of the demo, by number, that are blurred for the picture of weak poses."""
 AWAY = (300, 862)
 """A mouse position without effect on the image."""
-PREFERENCES = (260, 200, 980, 512)
+PREFERENCES = (260, 168, 980, 512)
 """Where the window of the preferences, which opens over the other one, shows those of the extension."""
 
 
@@ -150,10 +150,18 @@ def setting_up(window: Window, python: str) -> None:
     folder = blender.run(f"result = {preferences}.reconstructions")
     blender.run(f"{preferences}.reconstructions = ''")
     window.panels()
-    window.sidebar("first-panel", 265)
+    window.sidebar("first-panel", 305)
     blender.run(f"""
         with bpy.context.temp_override(**window_context()):
             bpy.ops.preferences.addon_show(module="{harness.PACKAGE}")
+    """)
+    blender.run("""
+        window = bpy.context.window_manager.windows[1]
+        area = window.screen.areas[0]
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with bpy.context.temp_override(window=window, area=area, region=region):
+            for _ in range(3):
+                bpy.ops.view2d.scroll_down(deltay=-40)
     """)
     window.save("preferences", PREFERENCES)
     blender.run(f"""
