@@ -106,8 +106,8 @@ def write_realityscan(scene, name: str = "cameras.csv", points: str | None = "cl
     return path
 
 
-def write_metashape(scene, kind: str = "frame", newer: bool = False) -> Path:
-    """Write Metashape's XML of a scene with an OPENCV or OPENCV_FISHEYE camera, in a chunk that CHUNK places.
+def write_metashape(scene, kind: str = "frame", newer: bool = False, chunk=CHUNK) -> Path:
+    """Write Metashape's XML of a scene with an OPENCV or OPENCV_FISHEYE camera, in a chunk that `chunk` places.
 
     `newer` files have the transform in a component.
     """
@@ -116,16 +116,16 @@ def write_metashape(scene, kind: str = "frame", newer: bool = False) -> Path:
     values = {"f": params[1], "b1": params[0] - params[1], "cx": params[2] - width / 2, "cy": params[3] - height / 2}
     values.update(zip(names, params[4:]))
     calibration = "".join(f"<{key}>{float(value)!r}</{key}>" for key, value in values.items())
-    scale = np.cbrt(np.linalg.det(CHUNK[:3, :3]))
+    scale = np.cbrt(np.linalg.det(chunk[:3, :3]))
     transform = (
-        f"<transform><rotation>{_text(CHUNK[:3, :3] / scale)}</rotation><translation>{_text(CHUNK[:3, 3])}"
+        f"<transform><rotation>{_text(chunk[:3, :3] / scale)}</rotation><translation>{_text(chunk[:3, 3])}"
         f"</translation><scale>{float(scale)!r}</scale></transform>"
     )
     inside = f'<components><component id="0">{transform}</component></components>' if newer else transform
     own = ' component_id="0"' if newer else ""
     cameras = []
     for number, (image, view) in enumerate(zip(scene.names, scene.viewmats)):
-        pose = np.linalg.inv(CHUNK) @ np.linalg.inv(view)
+        pose = np.linalg.inv(chunk) @ np.linalg.inv(view)
         pose[:3, :3] *= scale
         cameras.append(
             f'<camera id="{number}" sensor_id="3" label="{Path(image).stem}"{own}><transform>{_text(pose)}</transform>'

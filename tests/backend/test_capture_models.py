@@ -246,6 +246,44 @@ def test_metashape_gives_the_same_capture(write_capture, tmp_path, newer, cloud)
     assert_same(loaded(scene, tmp_path, "other"), wanted)
 
 
+AROUND = [(1, (0.0, 0.0, 0.0), 0.7), (2, (5.0, 0.3, 3.0), 0.9), (5, (-4.0, 0.2, 5.0), 0.9), (3, (-3.0, 0.0, -5.0), 0.9)]
+"""Spheres among the cameras and behind them, so that each view has a part of them."""
+
+
+def write_colored(write_capture):
+    """Write a scene whose points have colors of its photos."""
+    scene = write_capture(views=9, points=150, spheres=AROUND)
+    scene.rgb = np.stack([np.full_like(scene.point_objects, 90), scene.point_objects * 40, scene.point_objects], 1)
+    drop_colmap(scene)
+    return scene
+
+
+def placed(matrix, xyz):
+    return xyz @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+@pytest.mark.parametrize("scale", [0.1, 0.4, 2.5])
+@pytest.mark.parametrize("within", ["world", "chunk"])
+def test_metashape_point_cloud_is_placed_by_its_colors(write_capture, scale, within):
+    """A scale alone, as scale bars give it, must not shrink the cloud into the middle of all views."""
+    scene = write_colored(write_capture)
+    chunk = np.diag([scale, scale, scale, 1.0])
+    write_metashape(scene, chunk=chunk)
+    xyz = scene.xyz if within == "world" else placed(np.linalg.inv(chunk), scene.xyz)
+    write_ply(scene.folder / "cloud.ply", xyz, scene.rgb)
+    np.testing.assert_allclose(read_capture_model(scene.folder).xyz, scene.xyz, atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.1, 2.5])
+@pytest.mark.parametrize("transformed", [True, False])
+def test_point_cloud_beside_transforms_is_placed_by_its_colors(write_capture, scale, transformed):
+    scene = write_colored(write_capture)
+    applied = np.diag([scale, scale, scale, 1.0])
+    write_transforms(scene, points=None, applied=applied)
+    write_ply(scene.folder / "cloud.ply", placed(applied, scene.xyz) if transformed else scene.xyz, scene.rgb)
+    np.testing.assert_allclose(read_capture_model(scene.folder).xyz, scene.xyz, atol=1e-9)
+
+
 def test_metashape_of_fisheye(write_capture, tmp_path):
     scene = write_capture(model="OPENCV_FISHEYE", params=FISHEYE)
     wanted = loaded(scene, tmp_path, "colmap")

@@ -15,7 +15,7 @@ from ..colmap import Camera, Model, RawImage, RawPoints, export_again, validate
 from .lens import Lens
 from .photos import Photos, none_found
 from .point_cloud import find_point_cloud, read_point_cloud, seen_in
-from .visibility import with_observations
+from .visibility import color_agreement, with_observations
 
 UNNAMED = "the program that wrote it"
 """The program, in messages, of formats that several programs write."""
@@ -26,6 +26,9 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _ORTHOGONAL_WITHIN = 0.01
 _LEAST_SEEN = 0.5
 """Least fraction of a point cloud inside a view; with less, its coordinates are not those of the cameras."""
+
+_CLEARER = 0.2
+"""Least lead in the agreement of colors by which a placement of a point cloud is certain."""
 
 
 class Draft:
@@ -125,8 +128,9 @@ class Draft:
 
         Args:
             named: The point cloud, relative to the file, if the file names it.
-            placements: (4, 4) each, maps from the coordinates that the cloud may have to those of the cameras; the one
-                with the most points in the views is used, the first of equal ones.
+            placements: (4, 4) each, maps from the coordinates that the cloud may have to those of the cameras; of those
+                with most of the points in the views, the one whose colors agree with the photos is used or, where they
+                do not tell, the one with the most points in each view, the first of equal ones.
             export: What to export if there is no point cloud.
 
         Returns:
@@ -142,23 +146,41 @@ class Draft:
             )
         cloud = find_point_cloud(self.file, named, self.program, export)
         points = read_point_cloud(cloud, self.warnings)
-        best: Model | None = None
-        most: tuple[float, float] = (-1.0, -1.0)
-        for placement in placements:
+        # Photos that are missing may have seen the rest.
+        least = _LEAST_SEEN * len(self._images) / (len(self._images) + len(self._absent))
+        most = 0.0
+        fitting: list[tuple[Model, float]] = []
+        for number, placement in enumerate(placements):
+            if any(np.array_equal(placement, other) for other in placements[:number]):
+                continue
             with np.errstate(over="ignore", invalid="ignore"):
                 xyz = points.xyz @ placement[:3, :3].T + placement[:3, 3]
             model = self._model(RawPoints(points.ids, xyz, points.rgb, points.error), cloud)
             seen, hits = seen_in(model)
-            if best is None or hits > most[1] * (1 + 1e-9):
-                best, most = model, (seen, hits)
-        assert best is not None
-        # Photos that are missing may have seen the rest.
-        if most[0] < _LEAST_SEEN * len(self._images) / (len(self._images) + len(self._absent)):
+            most = max(most, seen)
+            if seen >= least:
+                fitting.append((model, hits))
+        if not fitting:
             raise InputError(
-                f"Only {most[0]:.0%} of the points of {cloud} lie in the views of {self.file}; export both from "
+                f"Only {most:.0%} of the points of {cloud} lie in the views of {self.file}; export both from "
                 f"{self.program} in the same coordinates."
             )
-        return with_observations(best)
+        return with_observations(self._best(fitting))
+
+    def _best(self, fitting: Sequence[tuple[Model, float]]) -> Model:
+        """Return the best of models that differ in the placement of their points, with the mean number of views."""
+        best, most = fitting[0]
+        for model, hits in fitting[1:]:
+            if hits > most * (1 + 1e-9):
+                best, most = model, hits
+        if len(fitting) > 1:
+            # The number of views alone favors clouds that are shrunk into the middle.
+            models = [model for model, _ in fitting]
+            agreement = color_agreement(models, self.photos.folder)
+            *_, second, first = sorted(agreement)
+            if first - max(second, 0.0) >= _CLEARER:
+                best = models[agreement.index(first)]
+        return best
 
     def _model(self, points: RawPoints, points_file: Path) -> Model:
         if self._absent and not self._images:
