@@ -70,6 +70,11 @@ class Files:
                 return None
         return None
 
+    def find_end(self, path: str) -> Path | None:
+        """Return the file that the longest part of a path from the right names, or None."""
+        parts = [part for part in re.split(r"[/\\]+", path) if part not in ("", ".", "..")]
+        return self.first("/".join(parts[start:]) for start in range(len(parts)))
+
     def first(self, names: Iterable[str]) -> Path | None:
         """Return the first existing file of `names`, or None."""
         return next((path for name in names if (path := self.find(name)) is not None), None)

@@ -39,6 +39,14 @@ APPLIED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """What nerfstudio applies to COLMAP's coordinates."""
 
 
+WRITERS = {
+    "transforms.json": lambda scene: write_transforms(scene, points=None),
+    "bundle.out": lambda scene: write_bundler(scene, points=False),
+    "cameras.csv": lambda scene: write_realityscan(scene, points=None),
+    "cameras.xml": write_metashape,
+}
+
+
 def loaded(scene, tmp_path, name):
     return load_capture(scene.folder, tmp_path / name)
 
@@ -60,6 +68,17 @@ def assert_same(found, wanted, observations=False):
     np.testing.assert_allclose(found.points.xyz, wanted.points.xyz, atol=1e-9)
     np.testing.assert_array_equal(found.points.rgb, wanted.points.rgb)
     assert found.warnings == wanted.warnings and found.counts["used"] == wanted.counts["used"]
+
+
+def assert_refused(run_command, folder: Path, tmp_path: Path, *words: str) -> str:
+    """Check that `check` and `import` refuse a capture with one sentence and exit code 2, and leave nothing behind."""
+    before = sorted(folder.rglob("*"))
+    sentence = assert_rejected(run_command("check", folder), *words)
+    assert len(sentence) < 700
+    out = tmp_path / "new" / "out"
+    assert assert_rejected(run_command("import", folder, "--out", out), *words)
+    assert not out.parent.exists() and sorted(folder.rglob("*")) == before
+    return sentence
 
 
 # The same as from COLMAP
@@ -381,6 +400,40 @@ def test_colmap_is_preferred(write_capture, tmp_path):
     assert len(loaded(scene, tmp_path, "cache").views) == 6
 
 
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.parametrize("stray", ["cameras.txt", "images.txt"])
+def test_stray_file_of_colmap_hides_no_other_format(write_capture, run_command, tmp_path, name, stray):
+    """Metashape's Omega Phi Kappa and Bundler's list may be called so."""
+    scene = write_capture(model="RADIAL", params=RADIAL) if name == "bundle.out" else write_capture()
+    drop_colmap(scene)
+    (scene.folder / stray).write_text("# PhotoID, X, Y, Z, Omega, Phi, Kappa\n")
+    assert_refused(run_command, scene.folder, tmp_path, "a COLMAP model needs cameras, images and points3D")
+    WRITERS[name](scene)
+    write_ply(scene.folder / "points3D.ply", scene.xyz, scene.rgb)
+    assert len(loaded(scene, tmp_path, "cache").views) == 6
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("start", ["images/", "/home/me/mug/images/", "C:\\mug\\images\\", "../mug/"])
+def test_colmap_may_name_images_from_another_folder(write_capture, tmp_path, suffix, start):
+    names = [f"{side}/{number}.png" for side in ("left", "right") for number in range(3)]
+    scene = write_capture(names=names, suffix=suffix)
+    wanted = loaded(scene, tmp_path, "right")
+    scene.names = [start + name for name in names]
+    write_capture.write_model(scene, scene.folder / "sparse" / "0", suffix)
+    assert_same(loaded(scene, tmp_path, "other"), wanted, observations=True)
+    (scene.folder / "images" / names[1]).unlink()
+    found = loaded(scene, tmp_path, "fewer")
+    assert [view.name for view in found.views] == [names[0], *names[2:]] and found.counts["missing"] == 1
+
+
+def test_images_of_other_folders_are_not_mistaken_for_each_other(write_capture, run_command, tmp_path):
+    scene = write_capture(views=4)
+    scene.names = ["a/view_000.png", "b/view_000.png", "a/view_001.png", "b/view_001.png"]
+    write_capture.write_model(scene, scene.folder / "sparse" / "0", ".bin")
+    assert_refused(run_command, scene.folder, tmp_path, "none of the 4 images")
+
+
 def test_dense_clouds_are_thinned_out(write_capture, tmp_path, monkeypatch):
     monkeypatch.setattr("backend.capture.models.point_cloud._MOST_POINTS", 50)
     scene = write_capture()
@@ -481,17 +534,6 @@ BAD_TRANSFORMS = {
 }
 
 
-def assert_refused(run_command, folder: Path, tmp_path: Path, *words: str) -> str:
-    """Check that `check` and `import` refuse a capture with one sentence and exit code 2, and leave nothing behind."""
-    before = sorted(folder.rglob("*"))
-    sentence = assert_rejected(run_command("check", folder), *words)
-    assert len(sentence) < 700
-    out = tmp_path / "new" / "out"
-    assert assert_rejected(run_command("import", folder, "--out", out), *words)
-    assert not out.parent.exists() and sorted(folder.rglob("*")) == before
-    return sentence
-
-
 @pytest.mark.parametrize("what", BAD_TRANSFORMS)
 def test_bad_transforms_are_refused(write_capture, run_command, tmp_path, what):
     scene = write_capture()
@@ -523,14 +565,6 @@ def test_photos_outside_are_never_read(write_capture, run_command, tmp_path):
     assert [view.name for view in found.views] == ["view_000.png", "view_002.png", "view_003.png"]
     write_transforms(scene, in_frame("file_path", str(outside)))
     assert found.counts["missing"] == 1 == loaded(scene, tmp_path, "again").counts["missing"]
-
-
-WRITERS = {
-    "transforms.json": lambda scene: write_transforms(scene, points=None),
-    "bundle.out": lambda scene: write_bundler(scene, points=False),
-    "cameras.csv": lambda scene: write_realityscan(scene, points=None),
-    "cameras.xml": write_metashape,
-}
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ...shared.errors import InputError
 from ...shared.formats.photos_source import IMAGES
 from ...shared.formats.regular_file import open_regular
 from ..colmap import Model, find_model, has_model, read_model
+from ..files import Files
 from . import bundler, metashape, realityscan, transforms
 
 _FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]], ...] = (
@@ -18,7 +20,7 @@ _FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]
     ("a Metashape XML file", r".*\.xml", metashape.recognizes, metashape.read),
     ("a RealityScan CSV file", r".*\.csv", realityscan.recognizes, realityscan.read),
 )
-"""What is looked for if there is no COLMAP model, in this order: name, file name, test of a file's start, reader."""
+"""What is looked for without a complete COLMAP model, in this order: name, file name, test of a file's start, reader."""
 
 _HEAD = 4096
 
@@ -36,12 +38,17 @@ def read_capture_model(folder: Path) -> Model:
     Raises:
         InputError: There is no model, or it cannot be used; the message names the file.
     """
+    incomplete: InputError | None = None
     try:
         if has_model(folder):
-            chosen, warnings = find_model(folder)
-            model = read_model(chosen)
-            model.warnings[:0] = warnings
-            return model
+            try:
+                chosen, warnings = find_model(folder)
+            except InputError as error:  # Other programs, too, write files such as cameras.txt.
+                incomplete = error
+            else:
+                model = _with_names_of_files(read_model(chosen), folder / "images")
+                model.warnings[:0] = warnings
+                return model
         files = _files_in(folder)
         photos = [path for path in (*files, *_files_in(folder / "images")) if path.suffix.lower() in IMAGES]
     except OSError as error:
@@ -65,6 +72,8 @@ def read_capture_model(folder: Path) -> Model:
             raise InputError(f"{folder} contains {names}, each {what} with cameras; leave only one of them there.")
         if found:
             return read(found[0])
+    if incomplete is not None:
+        raise incomplete
     if unreadable:
         raise InputError(unreadable[0])
     if _is_inside_capture(folder):
@@ -80,6 +89,22 @@ def read_capture_model(folder: Path) -> Model:
         f"{folder / 'sparse' / '0'}, or the cameras as transforms.json, Bundler's .out, Metashape's .xml or "
         "RealityScan's .csv."
     )
+
+
+def _with_names_of_files(model: Model, images: Path) -> Model:
+    """Return a model that names its images from another folder than images/ by their names in it.
+
+    COLMAP names images relative to the folder that it was given, which may be any folder above.
+    """
+    files = Files(images)
+    if not files.paths or any(files.find(image.name) for image in model.images):
+        return model
+    found = [(image, files.find_end(image.name)) for image in model.images]
+    paths = [path for _, path in found if path is not None]
+    if not paths or len(set(paths)) < len(paths):
+        return model
+    named = [replace(image, name=path.relative_to(images).as_posix()) for image, path in found if path is not None]
+    return replace(model, images=named, absent=tuple(image.name for image, path in found if path is None))
 
 
 def _is_inside_capture(folder: Path) -> bool:
