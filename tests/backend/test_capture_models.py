@@ -303,11 +303,12 @@ def test_point_cloud_beside_transforms_is_placed_by_its_colors(write_capture, sc
     np.testing.assert_allclose(read_capture_model(scene.folder).xyz, scene.xyz, atol=1e-9)
 
 
-def test_metashape_of_fisheye(write_capture, tmp_path):
+@pytest.mark.parametrize("kind", ["fisheye", "equidistant_fisheye"])
+def test_metashape_of_fisheye(write_capture, tmp_path, kind):
     scene = write_capture(model="OPENCV_FISHEYE", params=FISHEYE)
     wanted = loaded(scene, tmp_path, "colmap")
     drop_colmap(scene)
-    path = write_metashape(scene, kind="fisheye")
+    path = write_metashape(scene, kind=kind)
     write_ply(scene.folder / "cloud.ply", scene.xyz, scene.rgb)
     assert_same(loaded(scene, tmp_path, "other"), wanted)
     scene = write_capture(
@@ -333,6 +334,39 @@ def test_metashape_cameras_that_are_not_used_are_reported(write_capture, tmp_pat
     found = loaded(scene, tmp_path, "other")
     assert [view.name for view in found.views] == [scene.names[i] for i in (0, 4, 5, 6, 7, 8)]
     assert any("3 of 9 cameras" in warning and "largest component" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "why"),
+    [
+        ('<sensor id="8" label="360" type="spherical"/>', "the camera type spherical for the sensor 360"),
+        ('<sensor id="8" label="scan" type="frame"/>', "no calibration for the sensor scan"),
+    ],
+)
+def test_metashape_cameras_without_a_usable_lens_are_left_out(write_capture, tmp_path, sensor, why):
+    scene = write_capture(views=9, model="OPENCV", params=OPENCV)
+    drop_colmap(scene)
+    path = write_metashape(scene, newer=True)
+    write_ply(scene.folder / "cloud.ply", scene.xyz, scene.rgb)
+    text = path.read_text().replace("<sensors>", f"<sensors>{sensor}")
+    for number in range(6):
+        text = text.replace(f'<camera id="{number}" sensor_id="3"', f'<camera id="{number}" sensor_id="8"')
+    path.write_text(text)
+    found = loaded(scene, tmp_path, "other")
+    assert [view.name for view in found.views] == scene.names[6:]
+    warning = next(warning for warning in found.warnings if why in warning)
+    assert "6 of 9 cameras" in warning and not any("disabled" in warning for warning in found.warnings)
+
+
+def test_cameras_of_a_rig_without_an_own_pose_are_explained(write_capture, tmp_path):
+    scene = write_capture(views=4, model="OPENCV", params=OPENCV)
+    drop_colmap(scene)
+    path = write_metashape(scene)
+    write_ply(scene.folder / "cloud.ply", scene.xyz, scene.rgb)
+    path.write_text(re.sub(r'(label="view_003")[^>]*>.*?</transform>', r'\1 master_id="0">', path.read_text()))
+    assert any(
+        "or have only the pose of another camera of their rig" in w for w in loaded(scene, tmp_path, "a").warnings
+    )
 
 
 def test_photos_may_lie_beside_the_cameras(write_capture, tmp_path):
@@ -759,6 +793,7 @@ BAD_XML = {
     "huge size": (lambda text: text.replace('width="96"', 'width="99999999999"'), ("impossible size",)),
     "no focal length": (lambda text: text.replace("<f>90.0", "<f>0"), ("no focal length",)),
     "spherical": (lambda text: text.replace('"frame"', '"spherical"'), ("spherical", "fisheye")),
+    "equisolid": (lambda text: text.replace('"frame"', '"equisolid_fisheye"'), ("equisolid", "must be an equidistant")),
     "P3": (lambda text: text.replace("<b1>", "<p3>0.1</p3><b1>"), ("P3",)),
     "same photo": (lambda text: text.replace("view_001", "view_000"), ("two images",)),
 }  # fmt: skip

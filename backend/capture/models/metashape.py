@@ -7,6 +7,7 @@ versions, of its component leads from there to the world, in which point clouds 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -19,6 +20,8 @@ from .draft import Draft, shorten
 from .lens import Lens, brown, fisheye
 
 _PROGRAM = "Metashape"
+_FISHEYE = ("fisheye", "equidistant_fisheye")
+"""The name of equidistant lenses up to Metashape 2.2, and since."""
 _LARGEST_SKEW = 0.5
 """Pixels by which the skew B2 may move the border of an image before it is worth a warning."""
 
@@ -60,15 +63,20 @@ def read(file: Path) -> Model:
         for camera in cameras
         if camera.find("transform") is not None and camera.get("enabled", "true").lower() not in ("false", "0")
     ]
+    usable = _with_usable_lens(draft, posed, sensors)
     # Components are not aligned with each other.
-    components = Counter(camera.get("component_id") for camera in posed)
-    component = components.most_common(1)[0][0] if posed else None
-    used = [camera for camera in posed if camera.get("component_id") == component]
-    if len(used) < len(cameras):
-        why = " or are not in the largest component" if len(components) > 1 else ""
+    components = Counter(camera.get("component_id") for camera in usable)
+    component = components.most_common(1)[0][0] if usable else None
+    used = [camera for camera in usable if camera.get("component_id") == component]
+    if left_out := len(cameras) - len(posed) + len(usable) - len(used):
+        reasons = ["are disabled", "have no pose"]
+        if any(camera.get("master_id") and camera.find("transform") is None for camera in cameras):
+            reasons.append("have only the pose of another camera of their rig")
+        if len(components) > 1:
+            reasons.append("are not in the largest component")
         draft.warnings.append(
-            f"{len(cameras) - len(used)} of {len(cameras)} cameras in {file} are disabled, have no pose{why}; they are "
-            "left out."
+            f"{left_out} of {len(cameras)} cameras in {file} {', '.join(reasons[:-1])} or {reasons[-1]}; they are left "
+            "out."
         )
     placement = placed.get(component, own)
     lenses: dict[str | None, tuple[tuple[int, int], Lens]] = {}
@@ -125,13 +133,52 @@ def _placement(draft: Draft, transform: Element | None) -> np.ndarray:
     return placement
 
 
-def _lens(draft: Draft, sensor: Element) -> tuple[tuple[int, int], Lens]:
-    """Return the size in pixels and the lens of a sensor."""
-    who = f"for the sensor {shorten(sensor.get('label') or sensor.get('id') or '')}"
+def _with_usable_lens(draft: Draft, cameras: Sequence[Element], sensors: Mapping[str | None, Element]) -> list[Element]:
+    """Return the cameras whose lens can be used, with warnings about others; raises InputError if none can.
+
+    Chunks may contain panoramas or laser scans beside the photos.
+    """
+    unusable = {number: why for number, sensor in sensors.items() if (why := _why_unusable(sensor))}
+    found = [camera for camera in cameras if camera.get("sensor_id") not in unusable]
+    left_out = Counter(camera.get("sensor_id") for camera in cameras if camera.get("sensor_id") in unusable)
+    for number, count in left_out.items():
+        if not found:
+            raise draft.refusal(f"has {unusable[number]}")
+        draft.warnings.append(
+            f"{draft.file} has {unusable[number]}, so {count} of {len(cameras)} cameras with a pose are left out."
+        )
+    return found
+
+
+def _why_unusable(sensor: Element) -> str | None:
+    """Return what is wrong with the kind of a sensor's lens, or None."""
+    who, kind = _who(sensor), _kind(sensor)
+    if kind == "equisolid_fisheye":
+        return f"the camera type {kind} {who}, which must be an equidistant fisheye"
+    if kind not in ("frame", *_FISHEYE):
+        return f"the camera type {shorten(kind)} {who}, which is neither frame nor fisheye"
+    return f"no calibration {who}" if _calibration(sensor) is None else None
+
+
+def _who(sensor: Element) -> str:
+    return f"for the sensor {shorten(sensor.get('label') or sensor.get('id') or '')}"
+
+
+def _kind(sensor: Element) -> str:
+    calibration = _calibration(sensor)
+    own = None if calibration is None else calibration.get("type")
+    return own or sensor.get("type") or "frame"
+
+
+def _calibration(sensor: Element) -> Element | None:
     known = sensor.findall("calibration")
-    calibration = next((entry for entry in known if entry.get("class") == "adjusted"), next(iter(known), None))
-    if calibration is None:
-        raise draft.refusal(f"has no calibration {who}")
+    return next((entry for entry in known if entry.get("class") == "adjusted"), next(iter(known), None))
+
+
+def _lens(draft: Draft, sensor: Element) -> tuple[tuple[int, int], Lens]:
+    """Return the size in pixels and the lens of a sensor of a kind that can be used."""
+    who, calibration = _who(sensor), _calibration(sensor)
+    assert calibration is not None
     resolution = calibration.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     try:
@@ -144,9 +191,6 @@ def _lens(draft: Draft, sensor: Element) -> tuple[tuple[int, int], Lens]:
         element = calibration.find(name)
         return 0.0 if element is None else float(_numbers(draft, element, 1, f"{name} {who}")[0])
 
-    kind = calibration.get("type") or sensor.get("type") or "frame"
-    if kind not in ("frame", "fisheye"):
-        raise draft.refusal(f"has the camera type {shorten(kind)} {who}, which is neither frame nor fisheye")
     f, k = value("f"), (value("k1"), value("k2"), value("k3"), value("k4"))
     if not f:
         raise draft.refusal(f"has no focal length f {who}")
@@ -158,7 +202,7 @@ def _lens(draft: Draft, sensor: Element) -> tuple[tuple[int, int], Lens]:
     focal, center = (f + value("b1"), f), (width / 2 + value("cx"), height / 2 + value("cy"))
     # Metashape's P1 is OpenCV's p2, and its P2 is p1.
     tangential = value("p2"), value("p1")
-    if kind == "fisheye":
+    if _kind(sensor) in _FISHEYE:
         return (width, height), fisheye(focal, center, k, tangential)
     try:
         return (width, height), brown(focal, center, k, tangential, (width, height))

@@ -20,7 +20,7 @@ _FORMATS: tuple[tuple[str, str, Callable[[bytes], bool], Callable[[Path], Model]
     ("a Metashape XML file", r".*\.xml", metashape.recognizes, metashape.read),
     ("a RealityScan CSV file", r".*\.csv", realityscan.recognizes, realityscan.read),
 )
-"""What is looked for without a complete COLMAP model, in this order: name, file name, test of a file's start, reader."""
+"""What is looked for without a complete COLMAP model, in this order: name, file name, test of the start, reader."""
 
 _HEAD = 4096
 
