@@ -133,6 +133,18 @@ def test_transforms_of_fisheye(write_capture, tmp_path):
     assert_same(loaded(scene, tmp_path, "again"), wanted)
 
 
+def test_transforms_of_full_opencv(write_capture, tmp_path):
+    rest = (0.01, 0.03, -0.01, 0.005)
+    scene = write_capture(model="FULL_OPENCV", params=[*OPENCV, *rest])
+    wanted = loaded(scene, tmp_path, "colmap")
+    drop_colmap(scene)
+    write_transforms(
+        scene, lambda content: content.update(zip(("k3", "k4", "k5", "k6"), rest), camera_model="FULL_OPENCV")
+    )
+    assert_same(loaded(scene, tmp_path, "other"), wanted)
+    assert read_capture_model(scene.folder).cameras[1].params == (*OPENCV, *rest)
+
+
 def test_transforms_with_angle_alone(write_capture, tmp_path):
     scene = write_capture()
     wanted = loaded(scene, tmp_path, "colmap")

@@ -18,7 +18,8 @@ from ..colmap import Model
 from .draft import FLIP, Draft, shorten
 from .lens import Lens, brown, fisheye
 
-_BROWN = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV")
+_BROWN = ("OPENCV", "SIMPLE_RADIAL", "RADIAL")
+_QUOTIENT = ("FULL_OPENCV",)
 _PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE")
 _FISHEYE = ("OPENCV_FISHEYE",)
 
@@ -100,10 +101,10 @@ class _Entry:
         if name is None:
             name = "OPENCV_FISHEYE" if self._values.get("is_fisheye") else "OPENCV"
         model = str(name).upper()
-        if model not in (*_BROWN, *_PINHOLE, *_FISHEYE):
+        known = (*_PINHOLE, *_BROWN, *_QUOTIENT, *_FISHEYE)
+        if model not in known:
             raise self._draft.refusal(
-                f"has the camera_model {shorten(str(name))[:40]}, which is none of "
-                f"{', '.join((*_PINHOLE, *_BROWN, *_FISHEYE))}"
+                f"has the camera_model {shorten(str(name))[:40]}, which is none of {', '.join(known)}"
             )
         focal = self._focal(width, height)
         center = self.number("cx", width / 2), self.number("cy", height / 2)
@@ -112,6 +113,10 @@ class _Entry:
             return Lens("PINHOLE", (*focal, *center))
         if model in _FISHEYE:
             return fisheye(focal, center, (k1, k2, k3, k4))
+        if model in _QUOTIENT:
+            # As in OpenCV, k4 to k6 are those of the denominator.
+            rest = k3, k4, self.number("k5", 0.0), self.number("k6", 0.0)
+            return Lens("FULL_OPENCV", (*focal, *center, k1, k2, p1, p2, *rest))
         try:
             return brown(focal, center, (k1, k2, k3, k4), (p1, p2), (width, height))
         except ValueError as error:
