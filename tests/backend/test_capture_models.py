@@ -348,6 +348,20 @@ def test_metashape_cameras_that_are_not_used_are_reported(write_capture, tmp_pat
     assert any("3 of 9 cameras" in warning and "largest component" in warning for warning in found.warnings)
 
 
+def test_point_cloud_of_a_map_is_told_to_be_exported_in_local_coordinates(write_capture, run_command, tmp_path):
+    """Metashape places chunks with GPS by coordinates from the Earth's center, and exports clouds in those of a map."""
+    scene = write_capture(model="OPENCV", params=OPENCV)
+    drop_colmap(scene)
+    chunk = CHUNK.copy()
+    chunk[:3, 3] = 3.9e6, 0.7e6, 5.0e6
+    path = write_metashape(scene, chunk=chunk)
+    write_ply(scene.folder / "cloud.ply", scene.xyz + np.array([5e5, 5.4e6, 300.0]), scene.rgb)
+    words = (str(path), "cloud.ply", "in the chunk's local coordinates, not in those of a map")
+    assert_refused(run_command, scene.folder, tmp_path, *words)
+    write_ply(scene.folder / "cloud.ply", placed(np.linalg.inv(chunk), scene.xyz), scene.rgb)
+    np.testing.assert_allclose(read_capture_model(scene.folder).xyz, scene.xyz, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("sensor", "why"),
     [

@@ -27,6 +27,8 @@ _ORTHOGONAL_WITHIN = 0.01
 _LEAST_SEEN = 0.5
 """Least fraction of a point cloud inside a view; with less, its coordinates are not those of the cameras."""
 
+_FAR = 1e5
+"""Translation, in meters, of cameras that are placed on the Earth rather than in a scene."""
 _CLEARER = 0.2
 """Least lead in the agreement of colors by which a placement of a point cloud is certain."""
 
@@ -161,10 +163,13 @@ class Draft:
             if seen >= least:
                 fitting.append((model, hits))
         if not fitting:
-            raise InputError(
-                f"Only {most:.0%} of the points of {cloud} lie in the views of {self.file}; export both from "
-                f"{self.program} in the same coordinates."
-            )
+            advice = f"export both from {self.program} in the same coordinates"
+            if any(np.abs(placement[:3, 3]).max() > _FAR for placement in placements):
+                # Those of a map are curved, so that no placement leads from them to the cameras.
+                advice = (
+                    f"export the points from {self.program} in the chunk's local coordinates, not in those of a map"
+                )
+            raise InputError(f"Only {most:.0%} of the points of {cloud} lie in the views of {self.file}; {advice}.")
         return with_observations(self._best(fitting))
 
     def _best(self, fitting: Sequence[tuple[Model, float]]) -> Model:
