@@ -29,8 +29,8 @@ _LEAST_SEEN = 0.5
 
 _FAR = 1e5
 """Translation, in meters, of cameras that are placed on the Earth rather than in a scene."""
-_CLEARER = 0.2
-"""Least lead in the agreement of colors by which a placement of a point cloud is certain."""
+_CLEARER = 0.8
+"""Largest part of the second placement's disagreement in colors with which the first one is certain."""
 
 
 class Draft:
@@ -183,7 +183,7 @@ class Draft:
             models = [model for model, _ in fitting]
             agreement = color_agreement(models, self.photos.folder)
             *_, second, first = sorted(agreement)
-            if first - max(second, 0.0) >= _CLEARER:
+            if 1 - first <= _CLEARER * (1 - max(second, 0.0)):
                 best = models[agreement.index(first)]
         return best
 
