@@ -205,6 +205,39 @@ def write_index_pass(folder):
     return folder
 
 
+def write_parts(path, passes, attributes):
+    """Write an EXR file as Blender does: a part for each pass, with all attributes in the first one."""
+    passes = {"ViewLayer.Combined": dict.fromkeys("RGBA", np.zeros(SIZE[::-1], np.float32)), **passes}
+    parts = [
+        OpenEXR.Part(
+            {"type": OpenEXR.scanlineimage, **({} if number else attributes)},
+            {f"{name}.{channel}": plane for channel, plane in planes.items()},
+            name,
+        )
+        for number, (name, planes) in enumerate(passes.items())
+    ]
+    with OpenEXR.File(parts) as file:
+        file.write(str(path))
+
+
+def write_cryptomatte_of_cycles(folder):
+    for n in (0, 1):
+        ids = np.choose(masks_of(n), (0, *(name_bits(name) for name in NAMES.values()))).astype(np.uint32)
+        covered = (ids > 0).astype(np.float32)
+        planes = {"r": ids.view(np.float32), "g": covered, "b": 0 * covered, "a": 0 * covered}
+        attributes = header("ViewLayer.CryptoObject", list(NAMES.values()))
+        write_parts(folder / f"photo {n}.exr", {"ViewLayer.CryptoObject00": planes}, attributes)
+    return folder
+
+
+def write_index_pass_of_blender(folder):
+    for n in (0, 1):
+        planes = {"Material": np.ones(SIZE[::-1], np.float32), "Object": masks_of(n).astype(np.float32)}
+        passes = {f"ViewLayer.{kind} Index": {"X": plane} for kind, plane in planes.items()}
+        write_parts(folder / f"photo {n}.exr", passes, {})
+    return folder
+
+
 def write_ids(folder):
     for n in (0, 1):
         Image.fromarray(masks_of(n)).save(folder / f"photo {n}_mask.png")
@@ -224,7 +257,8 @@ def write_object_folders(folder):
 
 GIVEN = [
     write_coco_polygons, write_coco_runs, write_coco_compressed, write_panoptic, write_cvat_images, write_cvat_video,
-    write_label_studio, write_cryptomatte, write_index_pass, write_ids, write_object_folders,
+    write_label_studio, write_cryptomatte, write_cryptomatte_of_cycles, write_index_pass, write_index_pass_of_blender,
+    write_ids, write_object_folders,
 ]  # fmt: skip
 
 
@@ -236,9 +270,10 @@ def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_
     done = run_command("masks", photos, path, "--json")
     assert done.code == EXIT_DONE, done.err
     labels = json.loads((photos / "labels.json").read_text())
-    if write is not write_index_pass:
-        assert set(labels.values()) == set(NAMES.values())
-    number = {name: int(i) for i, name in labels.items()} if write is not write_index_pass else {"mug": 1, "box": 2}
+    number = {name: int(i) for i, name in labels.items()}
+    if write in (write_index_pass, write_index_pass_of_blender):
+        number = {name: i for i, name in NAMES.items()}
+    assert set(number) == set(NAMES.values())
     for n in (0, 1):
         found, true = read_mask(photos / "masks" / f"{photo(n)}.png"), masks_of(n)
         for i, name in NAMES.items():

@@ -14,7 +14,8 @@ import OpenEXR
 from ...shared.errors import InputError
 from .segments import Segments
 
-_INDEX = re.compile(r"(.*\.)?(IndexOB|IndexMA|object_?id|id)(\.[XYRV])?", re.IGNORECASE)
+_OBJECT_INDEX = re.compile(r"(.*\.)?(IndexOB|object[ _]?(index|id)|id)(\.[XYRV])?", re.IGNORECASE)
+_MATERIAL_INDEX = re.compile(r"(.*\.)?(IndexMA|material[ _]?index)(\.[XYRV])?", re.IGNORECASE)
 _COVERED = 0.5
 """A pixel shows an object that covers more of it than this."""
 
@@ -37,8 +38,9 @@ class ExrMasks:
         path = self._files[photo]
         try:
             with OpenEXR.File(str(path), separate_channels=True) as file:
-                header = dict(file.header())
-                channels = {name: np.array(each.pixels) for name, each in file.channels().items()}
+                # Blender writes a part for each pass, and describes Cryptomatte in the first one only.
+                header = {key: value for part in file.parts for key, value in part.header.items()}
+                channels = {name: np.array(each.pixels) for part in file.parts for name, each in part.channels.items()}
         except (OSError, RuntimeError, ValueError, TypeError) as error:
             raise InputError(f"{path} cannot be read as OpenEXR ({error}); render it again.") from error
         found = _cryptomatte(header, channels) or _indices(channels)
@@ -56,11 +58,13 @@ def _cryptomatte(header: dict[str, Any], channels: dict[str, np.ndarray]) -> Seg
         (str(name) for key, name in header.items() if re.fullmatch(r"cryptomatte/[^/]+/name", key)),
         key=lambda name: ("object" not in name.lower(), "asset" not in name.lower(), name),
     )
-    layer = next((name for name in layers if f"{name}00.R" in channels), None)
+    # Cycles names the channels in lower case, and other programs in upper case.
+    planes = {name.lower(): plane for name, plane in channels.items()}
+    layer = next((name for name in layers if {f"{name}00.r".lower(), f"{name}00.g".lower()} <= planes.keys()), None)
     if layer is None:
         return None
-    ids = np.ascontiguousarray(channels[f"{layer}00.R"], np.float32).view(np.uint32)
-    covered = channels[f"{layer}00.G"] > _COVERED
+    ids = np.ascontiguousarray(planes[f"{layer}00.r".lower()], np.float32).view(np.uint32)
+    covered = planes[f"{layer}00.g".lower()] > _COVERED
     key = next(key for key, name in header.items() if str(name) == layer and key.endswith("/name"))
     try:
         manifest = json.loads(header.get(key.removesuffix("name") + "manifest") or "{}")
@@ -72,8 +76,9 @@ def _cryptomatte(header: dict[str, Any], channels: dict[str, np.ndarray]) -> Seg
 
 
 def _indices(channels: dict[str, np.ndarray]) -> Segments | None:
-    """Return the objects of a pass of indices; None without one."""
-    name = next((name for name in sorted(channels) if _INDEX.fullmatch(name)), None)
+    """Return the objects of a pass of indices; None without one. Objects come before materials."""
+    kinds = (_OBJECT_INDEX, _MATERIAL_INDEX)
+    name = next((name for kind in kinds for name in sorted(channels) if kind.fullmatch(name)), None)
     if name is None:
         return None
     indices = np.rint(np.nan_to_num(channels[name].astype(np.float64))).astype(np.int64)
