@@ -314,6 +314,19 @@ def test_frames_of_a_video_are_the_photos_in_the_folder(photos, tmp_path, run_co
     assert run_command("masks", photos, path).code == EXIT_DONE
 
 
+def test_frames_of_a_part_of_a_video_are_counted_from_its_first_one(photos, tmp_path, run_command):
+    path = write_cvat_video(tmp_path)
+    meta = "<task><size>2</size><start_frame>30</start_frame><stop_frame>40</stop_frame>{}"
+    content = path.read_text().replace('frame="0"', 'frame="30"').replace('frame="1"', 'frame="40"')
+    path.write_text(content.replace("<task>", meta.format("<frame_filter>step=10</frame_filter>")))
+    assert run_command("masks", photos, path).code == EXIT_DONE
+    for n in (0, 1):
+        assert (read_mask(photos / "masks" / f"{photo(n)}.png") == masks_of(n)).all()
+    for other in ("<frame_filter/>", "<frame_filter>step=3</frame_filter>", "<frame_filter>step=4</frame_filter>"):
+        path.write_text(content.replace("<task>", meta.format(other)))
+        assert_rejected(run_command("masks", photos, path), "frame 40", "2 photos")
+
+
 def test_folders_of_objects_have_those_of_the_photos(photos, tmp_path):
     given = tmp_path / "given"
     for camera in ("left", "right"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Hashable, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ class CvatMasks:
         photos: the photos of the capture; the frames of a video are theirs in natural order.
 
     Raises:
-        InputError: the file is not valid, or of a video with another number of frames.
+        InputError: the file is not valid, or of a video with other frames.
     """
 
     what = "CVAT annotations"
@@ -71,12 +72,20 @@ class CvatMasks:
                 f"{self._file} is of a video of {frames} frames, and the capture has {len(ordered)} photos; annotate "
                 f"the photos in {photos.folder}."
             )
+        # Frames are numbered as in the video, of which a task may have a part, or every tenth frame.
+        first = int(root.findtext(".//meta//start_frame") or 0)
+        step = int((re.findall(r"step=(\d+)", root.findtext(".//meta//frame_filter") or "") or ["1"])[0])
         for track in tracks:
             key = ("track", track.get("id"))
             for each in track:
-                frame = int(each.get("frame", "-1"))
-                if each.tag in _SHAPES and each.get("outside") != "1" and 0 <= frame < len(ordered):
-                    name = ordered[frame]
+                if each.tag in _SHAPES and each.get("outside") != "1":
+                    number, rest = divmod(int(each.attrib["frame"]) - first, max(step, 1))
+                    if rest or not 0 <= number < len(ordered):
+                        raise InputError(
+                            f"{self._file} has a shape in frame {each.attrib['frame']}, which is none of the "
+                            f"{len(ordered)} photos; annotate the photos in {photos.folder}."
+                        )
+                    name = ordered[number]
                     self._sizes[name] = checked_size(width, height, f"{self._file}: {name}")
                     self._shapes.setdefault(name, []).append((each, track.get("label", ""), key))
 
