@@ -266,8 +266,8 @@ class Capture:
         """
         if self.is_original(index):
             return ids
-        # Views of one camera are undistorted alike.
-        at = self._cache.get(("undistorted", self._raw[index][0].id), lambda: self._pixels_of_photo(index))
+        # Views of one camera are undistorted alike, unless their photos have different sizes.
+        at = self._cache.get(("undistorted", self._raw[index][0]), lambda: self._pixels_of_photo(index))
         return np.where(at >= 0, ids.ravel()[at], ids.dtype.type(0))
 
     def _pixels_of_photo(self, index: int) -> np.ndarray:

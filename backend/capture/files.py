@@ -226,9 +226,15 @@ def mask_size(path: Path) -> tuple[int, int]:
 
 
 def same_shape(size: tuple[int, int], of: tuple[int, int]) -> bool:
-    """Return whether a mask's size (width, height) has the proportions of another; one pixel may be due to rounding."""
+    """Return whether a mask's size (width, height) has nearly the proportions of another."""
     expected = size[1] * of[0] / of[1]
-    return abs(size[0] - expected) <= max(1.0, _ASPECT_TOLERANCE * expected)
+    return is_resized(size, of) or abs(size[0] - expected) <= _ASPECT_TOLERANCE * expected
+
+
+def is_resized(size: tuple[int, int], of: tuple[int, int]) -> bool:
+    """Return whether a size (width, height) is another one, reduced or enlarged and rounded to whole pixels."""
+    # Both sides of the smaller one may be rounded up or down.
+    return abs(size[0] * of[1] - size[1] * of[0]) <= max(sum(size), sum(of))
 
 
 def read_mask(path: Path, color: bool | None = None) -> np.ndarray:

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -27,6 +27,7 @@ from .files import (
     Files,
     image_size,
     is_color_mask,
+    is_resized,
     is_three_channel,
     mask_names,
     mask_size,
@@ -37,7 +38,7 @@ from .files import (
 from .made_masks import is_made
 from .models import none_found, photos_folder, read_capture_model
 from .names import HELD_OUT, read_held_out, read_names
-from .undistort import Pinhole, is_pinhole, pinhole_for
+from .undistort import Pinhole, is_pinhole, pinhole_for, scaled
 
 Problem = Callable[[str], None]
 """Handler of a problem, given as a sentence; either raises or collects it."""
@@ -54,7 +55,10 @@ _R = TypeVar("_R")
 
 @dataclass
 class Source:
-    """One image of the model that exists on disk, with its mask, its camera and the pinhole camera of its view."""
+    """One image of the model that exists on disk, with its mask, its camera and the pinhole camera of its view.
+
+    The camera and the image's observations are scaled to the photo where that has another size than the model says.
+    """
 
     image: Image
     camera: Camera
@@ -115,11 +119,16 @@ def survey_capture(
     no_names: dict[int, str] = {}
     names = no_names if photos_only else _tolerate(problem, lambda: read_names(folder), no_names)
 
-    targets: dict[int, Pinhole | None] = {}
-    for camera_id in sorted({image.camera_id for image in model.images}):
-        targets[camera_id] = _tolerate(
-            problem, partial(pinhole_for, model.cameras[camera_id], model.file("cameras"), max_size), None
-        )
+    targets: dict[Camera, Pinhole | None] = {}
+
+    def target_of(camera: Camera) -> Pinhole | None:
+        if camera not in targets:
+            targets[camera] = _tolerate(problem, partial(pinhole_for, camera, model.file("cameras"), max_size), None)
+        return targets[camera]
+
+    camera_ids = sorted({image.camera_id for image in model.images})
+    for camera_id in camera_ids:
+        target_of(model.cameras[camera_id])
     if not any(targets.values()):
         raise InputError(f"{model.file('cameras')} contains no usable camera; run {model.program} again.")
 
@@ -131,7 +140,7 @@ def survey_capture(
     files = Files(images_folder, without=(masks_folder.name,) if images_folder == folder else ())
     masks = Files(masks_folder) if masks_folder.is_dir() and not photos_only else None
     total, absent = len(model.images) + len(model.absent), list(model.absent)
-    sources, unmasked = [], []
+    sources, unmasked, resized = [], [], []
     for image in sorted(model.images, key=lambda image: image.name):
         if re.match(r"[/\\]|[A-Za-z]:", image.name) or ".." in re.split(r"[/\\]", image.name):
             problem(
@@ -150,9 +159,15 @@ def survey_capture(
                 problem(f"{jpeg} is a JPEG, whose compression changes IDs; save it as PNG, or use `masks`.")
             if mask_path is None:
                 unmasked.append(image.name)
-        target = targets[image.camera_id]
-        if target is not None:
-            sources.append(Source(image, model.cameras[image.camera_id], target, path, mask_path))
+        camera = model.cameras[image.camera_id]
+        if target_of(camera) is None:
+            continue
+        fitting = _fitting(camera, path)
+        if fitting != camera:
+            resized.append((image.name, fitting, camera))
+            image = replace(image, xy=image.xy * [fitting.width / camera.width, fitting.height / camera.height])
+        if (target := target_of(fitting)) is not None:
+            sources.append(Source(image, fitting, target, path, mask_path))
     present = total - len(absent)
     if absent and not present:
         raise none_found(images_folder, absent, model.file("images"))
@@ -168,6 +183,13 @@ def survey_capture(
         warnings.append(
             f"{len(unregistered)} of {len(on_disk)} images in {images_folder} are not in the model, for instance "
             f"{unregistered[0]}; {model.program} could not register them, and they are not used."
+        )
+    if resized:
+        name, fitting, camera = resized[0]
+        warnings.append(
+            f"{len(resized)} of {present} images have another size than their cameras, which are scaled to them; for "
+            f"instance {name} is {fitting.width}x{fitting.height} pixels, and its camera in {model.file('cameras')} "
+            f"{camera.width}x{camera.height}."
         )
     if unmasked:
         first = masks_folder / Path(unmasked[0]).with_suffix(".png")
@@ -194,7 +216,7 @@ def survey_capture(
         "unregistered": len(unregistered),
         "masks": present - len(unmasked) if masks is not None else 0,
         "points": len(model.xyz),
-        "cameras": dict(Counter(model.cameras[i].model for i in sorted(targets))),
+        "cameras": dict(Counter(model.cameras[i].model for i in camera_ids)),
     }
     made_from = read_source(folder)
     return Survey(
@@ -239,6 +261,16 @@ def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
             if _tolerate(problem, partial(is_color_mask, source.mask_path), False):
                 return True
     return False
+
+
+def _fitting(camera: Camera, photo: Path) -> Camera:
+    """Return an image's camera, scaled to a photo that was reduced or enlarged, but not cropped."""
+    own = camera.width, camera.height
+    try:
+        size = image_size(photo)
+    except InputError:
+        return camera  # It is reported where the photo is read.
+    return scaled(camera, *size) if size != own and is_resized(size, own) else camera
 
 
 def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +47,13 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
         height=camera.height,
         params=list(camera.params),
     )
+
+
+def scaled(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera of images that were scaled to this size in pixels; the distortion does not depend on it."""
+    lens = to_pycolmap(camera)
+    lens.rescale(width, height)
+    return replace(camera, width=width, height=height, params=tuple(map(float, lens.params)))
 
 
 def distort(camera: pycolmap.Camera, xy: np.ndarray) -> np.ndarray:

@@ -667,6 +667,57 @@ def test_masks_of_other_size_are_resized_nearest(write_capture, tmp_path, size):
         assert mask is not None and mask.shape == (72, 96) and (mask == scene.ids[index]).mean() > 0.95
 
 
+def resize(scene, size, of=slice(None), masks=True):
+    """Resize photos, and masks, of a capture, but not the cameras."""
+    for folder, method in (("images", Image.Resampling.BOX), ("masks", Image.Resampling.NEAREST)):
+        for name in scene.names[of] if masks or folder == "images" else ():
+            path = scene.folder / folder / name
+            Image.open(path).resize(size, method).save(path)
+
+
+@pytest.mark.parametrize("has_masks_of_photos", [True, False])
+@pytest.mark.parametrize(("size", "reduced"), [((96, 72), (48, 36)), ((97, 71), (49, 35)), ((48, 36), (97, 73))])
+@pytest.mark.parametrize("name", ["PINHOLE", "SIMPLE_RADIAL"])
+def test_cameras_are_scaled_to_resized_photos(write_capture, tmp_path, name, size, reduced, has_masks_of_photos):
+    params = (size[0], size[0] / 2, size[1] / 2, 0.01) if name == "SIMPLE_RADIAL" else None
+    scene = write_capture("resized", views=3, size=size, model=name, params=params)
+    resize(scene, reduced, masks=has_masks_of_photos)
+    (width, height), (sx, sy) = reduced, np.divide(reduced, size)
+    params = (size[0] * sx, size[0] * sy, width / 2, height / 2)
+    if name == "SIMPLE_RADIAL":
+        params = (size[0] * (sx + sy) / 2, width / 2, height / 2, 0.01)
+    own = write_capture("own", views=3, size=reduced, model=name, params=params)
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    expected = load_capture(own.folder, tmp_path / "own cache")
+    assert any("3 of 3 images" in line and f"{width}x{height}" in line for line in capture.warnings)
+    for index in range(3):
+        view, other = capture.views[index], expected.views[index]
+        assert (view.width, view.height) == (other.width, other.height)
+        np.testing.assert_allclose(view.K, other.K, rtol=1e-9)
+        points = capture.keypoints(index)
+        local = scene.xyz[points.point_index] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        pixels = local @ view.K.T
+        np.testing.assert_allclose(points.xy, pixels[:, :2] / pixels[:, 2:], atol=0.5)
+        assert (capture.mask(index) == expected.mask(index)).mean() > 0.9
+        assert np.abs(capture.image(index).astype(int) - expected.image(index)).mean() < 12
+        assert capture.photo_mask(index, capture.mask(index)).shape == (height, width)
+
+
+def test_photos_of_one_camera_may_have_different_sizes(write_capture, tmp_path):
+    scene = write_capture(views=3, model="SIMPLE_RADIAL", params=(96, 48, 36, 0.05))
+    resize(scene, (48, 36), of=slice(1))
+    capture = load_capture(scene.folder, tmp_path / "cache")
+    shapes = [capture.photo_mask(index, capture.mask(index)).shape for index in range(3)]
+    assert shapes == [(36, 48), (72, 96), (72, 96)]
+
+
+@pytest.mark.parametrize("size", [(72, 96), (96, 54), (90, 72), (24, 32)])
+def test_cropped_and_turned_photos_are_refused(write_capture, tmp_path, size):
+    scene = write_capture(views=3)
+    resize(scene, size, masks=False)
+    assert_load_rejected(scene.folder, tmp_path, f"{size[0]}x{size[1]}", "96x72", "images that the cameras")
+
+
 def test_few_missing_masks_are_allowed(write_capture, tmp_path):
     scene = write_capture(views=6)
     for name in scene.names[:3]:
