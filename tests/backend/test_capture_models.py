@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -393,6 +394,28 @@ def test_cameras_of_a_rig_without_an_own_pose_are_explained(write_capture, tmp_p
     assert any(
         "or have only the pose of another camera of their rig" in w for w in loaded(scene, tmp_path, "a").warnings
     )
+
+
+def test_names_that_fit_several_photos_are_reported(write_capture, tmp_path):
+    """Cameras number photos anew in each folder."""
+    scene = write_capture(views=4)
+    drop_colmap(scene)
+    write_realityscan(scene)
+    images = scene.folder / "images"
+    for folder in ("100MEDIA", "101MEDIA"):
+        (images / folder).mkdir()
+        for name in scene.names:
+            shutil.copy(images / name, images / folder / name)
+    for name in scene.names[:2]:
+        (images / name).unlink()
+    found = loaded(scene, tmp_path, "some")
+    assert [view.name for view in found.views] == scene.names[2:]
+    several = f"{scene.names[0]} both 100MEDIA/{scene.names[0]} and 101MEDIA/{scene.names[0]}"
+    assert any(warning.startswith("2 images") and several in warning for warning in found.warnings)
+    for name in scene.names[2:]:
+        (images / name).unlink()
+    with pytest.raises(InputError, match=f"4 images .*{several}"):
+        loaded(scene, tmp_path, "none")
 
 
 def test_photos_may_lie_beside_the_cameras(write_capture, tmp_path):

@@ -48,6 +48,7 @@ class Draft:
         self.photos = Photos(file.parent)
         self.warnings: list[str] = []
         self._absent: list[str] = []
+        self._ambiguous: list[tuple[str, Sequence[str]]] = []
         self._cameras: dict[tuple[Lens, int, int], Camera] = {}
         self._images: list[RawImage] = []
 
@@ -86,10 +87,13 @@ class Draft:
             InputError: The pose is not one of a camera, or the photo cannot be read.
         """
         shown = shorten(reference)
-        name = self.photos.find(reference)
-        if name is None:
+        fitting = self.photos.fitting(reference)
+        if len(fitting) != 1:
             self._absent.append(shown)
+            if fitting:
+                self._ambiguous.append((shown, fitting))
             return
+        name = fitting[0]
         width, height = size or self.photos.size(name)
         key = (lens(width, height), width, height)
         if key not in self._cameras:
@@ -188,8 +192,15 @@ class Draft:
         return best
 
     def _model(self, points: RawPoints, points_file: Path) -> Model:
+        ambiguous = []
+        if self._ambiguous:
+            shown, fitting = self._ambiguous[0]
+            ambiguous.append(
+                f"{len(self._ambiguous)} images that {self.file} names fit several photos in {self.photos.folder}, for "
+                f"instance {shown} both {fitting[0]} and {fitting[1]}; align photos with distinct names."
+            )
         if self._absent and not self._images:
-            raise none_found(self.photos.folder, self._absent, self.file)
+            raise InputError(ambiguous[0]) if ambiguous else none_found(self.photos.folder, self._absent, self.file)
         return validate(
             Model(
                 self.file.parent,
@@ -200,7 +211,7 @@ class Draft:
                 points.rgb,
                 points.error,
                 points.ids,
-                list(self.warnings),
+                [*self.warnings, *ambiguous],
                 self.program,
                 tuple(self._absent),
             ),

@@ -56,18 +56,24 @@ class Photos:
 
     def find(self, reference: str) -> str | None:
         """Return the name of a photo, relative to the folder, or None; of several that fit equally, none does."""
+        fitting = self.fitting(reference)
+        return fitting[0] if len(fitting) == 1 else None
+
+    def fitting(self, reference: str) -> Sequence[str]:
+        """Return the names of the photos that fit a reference equally, relative to the folder."""
         parts = [part for part in re.split(r"[/\\]+", reference) if part not in ("", ".", "..")]
         for start in range(len(parts)):
             end = "/".join(parts[start:])
             found = self._files.find(end)
             if found is not None and found.suffix.lower() in IMAGES:
-                return found.relative_to(self.folder).as_posix()
-            if name := _only(self._by_stem.get(end.casefold())):
-                return name
+                return (found.relative_to(self.folder).as_posix(),)
+            of_stem = self._by_stem.get(end.casefold(), ())
+            if len(of_stem) == 1:
+                return of_stem
         if len(parts) != 1:
-            return None
+            return ()
         last = parts[-1].casefold()
-        return _only(self._by_name.get(last)) or _only(self._by_name.get(_split(last)[0]))
+        return self._by_name.get(last) or self._by_name.get(_split(last)[0], ())
 
     def size(self, name: str) -> tuple[int, int]:
         """Read the width and height of a photo; raises InputError with its path."""
@@ -78,7 +84,3 @@ def _split(path: str) -> tuple[str, str]:
     """Split a path into the part before the suffix of a photo, and that suffix, which may be empty."""
     stem, dot, suffix = path.rpartition(".")
     return (stem, dot + suffix) if stem and dot + suffix.lower() in IMAGES else (path, "")
-
-
-def _only(paths: list[str] | None) -> str | None:
-    return paths[0] if paths and len(paths) == 1 else None
