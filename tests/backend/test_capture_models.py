@@ -18,6 +18,7 @@ from PIL import Image
 from backend.capture import check_capture, load_capture
 from backend.capture.models import read_capture_model
 from backend.capture.models.lens import brown
+from backend.capture.models.point_cloud import read_point_cloud
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
 from backend.training.exposure.gains import measure_gains, varies
 
@@ -524,6 +525,20 @@ def test_dense_clouds_are_thinned_out(write_capture, tmp_path, monkeypatch):
     write_transforms(scene)
     found = loaded(scene, tmp_path, "cache")
     assert len(found.points.xyz) == 50 and any("180 points, of which 50" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_points_of_dense_clouds_are_read_in_blocks(tmp_path, monkeypatch, text):
+    """All points of a laser scan would not fit into memory."""
+    monkeypatch.setattr("backend.capture.models.point_cloud._MOST_POINTS", 50)
+    monkeypatch.setattr("backend.shared.formats.ply._BLOCK", 7)
+    xyz, warnings = np.arange(480.0).reshape(160, 3), []
+    rgb = np.arange(480).reshape(160, 3) // 2
+    write_ply(tmp_path / "cloud.ply", xyz, rgb, text)
+    found = read_point_cloud(tmp_path / "cloud.ply", warnings)
+    rows = np.linspace(0, 159, 50).astype(int)
+    assert (found.xyz == xyz[rows]).all() and (found.rgb == rgb[rows]).all()
+    assert "160 points, of which 50" in warnings[0]
 
 
 @pytest.mark.parametrize("kind", ["u2", "f4", "none"])

@@ -8,7 +8,7 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from ...shared.errors import InputError
-from ...shared.formats.ply import read_vertices
+from ...shared.formats.ply import read_chosen_vertices
 from ...shared.formats.regular_file import read_regular
 from ..colmap import Model, RawPoints, export_again
 
@@ -100,13 +100,10 @@ def _used(count: int) -> np.ndarray:
 
 def _read_ply(path: Path) -> tuple[int, np.ndarray, np.ndarray]:
     """Return the number of points in the file, and positions and colors of those that are used."""
-    table = read_vertices(path, text=True)
+    count, table = read_chosen_vertices(path, _used)
     names = table.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"{path} has no coordinates x, y and z; {export_again('the program that wrote it')}.")
-    count = len(table)
-    # Before the conversion, since dense clouds would take gigabytes.
-    table = table[_used(count)]
     xyz = np.stack([table[axis].astype(np.float64) for axis in "xyz"], 1)
     channels = next((group for group in _COLORS if set(group) <= set(names)), None)
     if channels is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +15,8 @@ from .regular_file import open_regular
 
 LONGEST_HEADER = 1 << 20
 
+_BLOCK = 1_000_000
+"""Number of vertices that are read at a time where not all are kept."""
 _WORDS = {
     "i1": ("char", "int8"),
     "u1": ("uchar", "uint8"),
@@ -71,30 +73,57 @@ def write_vertex_blocks(
             raise ValueError(f"{path} was to have {count} vertices, not {written}")
 
 
-def read_vertices(path: Path, text: bool = False) -> np.ndarray:
+def read_vertices(path: Path) -> np.ndarray:
     """Read the vertices of a PLY file; later elements are ignored.
 
     Args:
-        path: The file to read.
-        text: Whether ASCII files are read, too; else they are refused, since they round numbers.
+        path: The file to read. ASCII files are refused, since they round numbers.
 
     Returns:
         A structured array (N,) with the file's property names, order and types.
 
     Raises:
-        InputError: The file is missing or truncated, is ASCII without `text`, or has no vertices with scalar
-            properties.
+        InputError: The file is missing or truncated, is ASCII, or has no vertices with scalar properties.
     """
     try:
         with open_regular(path) as file:
-            order, dtype, count = _read_header(file, path, text)
+            _, dtype, count = _read_header(file, path, text=False)
+            _check_size(path, count, os.fstat(file.fileno()).st_size - file.tell(), dtype.itemsize)
+            return np.fromfile(file, dtype, count)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
+
+
+def read_chosen_vertices(path: Path, choose: Callable[[int], np.ndarray]) -> tuple[int, np.ndarray]:
+    """Read some vertices of a PLY file, binary or ASCII, without having all of them in memory.
+
+    Args:
+        path: The file to read.
+        choose: Returns the rows that are wanted of a number of vertices, ascending.
+
+    Returns:
+        The number of all vertices, and a structured array of the chosen ones.
+
+    Raises:
+        InputError: The file is missing or truncated, or has no vertices with scalar properties.
+    """
+    try:
+        with open_regular(path) as file:
+            order, dtype, count = _read_header(file, path, text=True)
             available = os.fstat(file.fileno()).st_size - file.tell()
-            if order:
-                _check_size(path, count, available, dtype.itemsize)
-                return np.fromfile(file, dtype, count)
-            # A digit and a separator for each value at least, which limits what a wrong count can allocate.
-            _check_size(path, count, available + 1, 2 * len(dtype.names or ()))
-            return _read_text(file, path, dtype, count)
+            # In text a digit and a separator for each value at least, which limits what a wrong count can allocate.
+            size, more = (dtype.itemsize, 0) if order else (2 * len(dtype.names or ()), 1)
+            _check_size(path, count, available + more, size)
+            rows = choose(count)
+            table = np.zeros(len(rows), dtype)
+            for first in range(0, count, _BLOCK):
+                last = min(first + _BLOCK, count)
+                block = np.fromfile(file, dtype, last - first) if order else _read_text(file, path, dtype, last - first)
+                if len(block) < last - first:
+                    raise _truncated(path, count, first + len(block))
+                begin, end = np.searchsorted(rows, [first, last])
+                table[begin:end] = block[rows[begin:end] - first]
+            return count, table
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror or error}).") from error
 
@@ -116,24 +145,23 @@ def read_comments(path: Path) -> list[str]:
 
 def _check_size(path: Path, count: int, available: int, size: int) -> None:
     if available < count * size:
-        raise InputError(
-            f"{path} is truncated: its header specifies {count} vertices, but only {available // size} are there."
-        )
+        raise _truncated(path, count, available // size)
 
 
-def _read_text(file: BinaryIO, path: Path, dtype: np.dtype, count: int) -> np.ndarray:
-    """Read the vertices of an ASCII file from the end of its header on."""
-    names, table = dtype.names or (), np.zeros(count, dtype)
-    if not count:
-        return table
+def _truncated(path: Path, count: int, there: int) -> InputError:
+    return InputError(f"{path} is truncated: its header specifies {count} vertices, but only {there} are there.")
+
+
+def _read_text(file: BinaryIO, path: Path, dtype: np.dtype, most: int) -> np.ndarray:
+    """Read at most this many vertices of an ASCII file from where it is on; fewer if it ends before."""
+    names = dtype.names or ()
     try:
-        values = np.loadtxt(file, np.float64, comments=None, ndmin=2, max_rows=count, encoding="latin-1")
+        values = np.loadtxt(file, np.float64, comments=None, ndmin=2, max_rows=most, encoding="latin-1")
     except ValueError as error:
         raise InputError(f"{path} has a vertex that is not {len(names)} numbers; save it as binary PLY.") from error
-    if len(values) < count:
-        raise InputError(
-            f"{path} is truncated: its header specifies {count} vertices, but only {len(values)} are there."
-        )
+    table = np.zeros(len(values), dtype)
+    if not len(values):
+        return table
     if values.shape[1] != len(names):
         raise InputError(f"{path} has a vertex that is not {len(names)} numbers; save it as binary PLY.")
     for column, name in zip(values.T, names):
