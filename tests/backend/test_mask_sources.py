@@ -12,7 +12,7 @@ from backend.capture import load_capture
 from backend.capture.files import read_mask
 from backend.capture.mask_sources import open_source
 from backend.capture.mask_sources.label_studio import unpack
-from backend.capture.mask_sources.segments import Shape, draw_shapes, run_lengths
+from backend.capture.mask_sources.segments import Shape, draw_shapes, polygon, run_lengths
 from backend.film.cryptomatte import header, name_bits
 from backend.sfm.sources.photos import take_photos
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
@@ -47,8 +47,9 @@ def photo(number):
 
 
 def corners(inside):
+    """The left, top, right and bottom edges of a rectangle, in pixels from the edges of the photo."""
     rows, columns = np.nonzero(inside)
-    return columns.min(), rows.min(), columns.max(), rows.max()
+    return columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
 
 
 def compressed(inside):
@@ -117,7 +118,7 @@ def cvat_shapes(n):
     left, top, right, bottom = corners(masks_of(n) == 1)
     points = ";".join(f"{x},{y}" for x, y in ((left, top), (right, top), (right, bottom), (left, bottom)))
     x, y, right, bottom = corners(masks_of(n) == 2)
-    wide, tall = right - x + 1, bottom - y + 1
+    wide, tall = right - x, bottom - y
     box = f'rle="0, {wide * tall}" left="{x}" top="{y}" width="{wide}" height="{tall}"'
     return f'<polygon label="mug" points="{points}" {{0}}/>', f'<mask label="box" {box} {{1}}/>'
 
@@ -452,6 +453,23 @@ def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):
     assert run_command("masks", photos, given).code == run_command("masks", photos, given).code == EXIT_DONE
     (photos / "masks" / "masks.json").unlink()
     assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
+
+
+def test_shapes_measure_from_the_edges_of_pixels():
+    box = polygon([(10, 5), (20, 5), (20, 15), (10, 15)], SIZE)
+    assert box[5:15, 10:20].all() and box.sum() == 100
+    assert (box == polygon([(9.6, 4.6), (20.4, 4.6), (20.4, 15.4), (9.6, 15.4)], SIZE)).all()
+    assert not polygon([(1, 1), (30, 25)], SIZE).any() and not polygon([], SIZE).any()
+    outside = [(-1e300, -1e300), (1e300, -1e300), (1e300, 1e300), (-1e300, 1e300)]
+    assert polygon(outside, SIZE).all() and not polygon([(50, 5), (60, 5), (60, 15)], SIZE).any()
+
+
+def test_shapes_that_touch_share_no_pixel():
+    rng = np.random.default_rng(0)
+    border = [(0, 0), (20, 0), (40, 0), (40, 15), (40, 30), (20, 30), (0, 30), (0, 15)]
+    for center in [(20, 15), (20.5, 15.5), *rng.uniform((1, 1), (39, 29), (20, 2)).tolist()]:
+        parts = [polygon([a, b, center], SIZE) for a, b in zip(border, border[1:] + border[:1])]
+        assert (np.sum(parts, 0) == 1).all()
 
 
 def test_segments_take_no_more_memory_than_their_boxes():

@@ -7,12 +7,13 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from PIL import Image, ImageDraw
 from pycocotools import mask as coco_masks
 
 from ...shared.errors import InputError
 
 LARGEST_SIDE = 32768
+_FARTHEST = 1e9
+"""Corners beyond are moved there, far outside of all photos, so that products of them are finite."""
 
 
 class Segments(NamedTuple):
@@ -77,11 +78,33 @@ def draw_shapes(shapes: Iterable[Shape], size: tuple[int, int]) -> Segments:
 
 
 def polygon(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.ndarray:
-    """Return the pixels (h, w) bool inside of a polygon with corners (x, y) in pixels."""
-    image = Image.new("1", size)
-    if len(corners) > 2:
-        ImageDraw.Draw(image).polygon([(float(x), float(y)) for x, y in corners], fill=1, outline=1)
-    return np.array(image)
+    """Return the pixels (h, w) bool whose centers are inside of a polygon.
+
+    Args:
+        corners: (x, y) in pixels from the edges of the photo, whose first pixel has its center at (0.5, 0.5). Shapes
+            that touch have no pixel in common.
+        size: Width and height of the photo.
+
+    Raises:
+        ValueError: A corner is not a number.
+    """
+    width, height = size
+    points = np.array([(x, y) for x, y in corners], np.float64).reshape(-1, 2)
+    if not np.isfinite(points).all():
+        raise ValueError("a corner that is not a number")
+    points = np.clip(points, -_FARTHEST, _FARTHEST)
+    # A pixel is inside if an odd number of edges cross its row on its left.
+    crossed = np.zeros((height, width + 1), bool)
+    for edge in zip(points.tolist(), np.roll(points, -1, 0).tolist(), strict=True):
+        # Always downwards, so that two shapes round an edge that they share alike.
+        (x, top), (other_x, bottom) = sorted(edge, key=lambda corner: corner[1])
+        first, last = (min(max(math.ceil(each - 0.5), 0), height) for each in (top, bottom))
+        if first < last:
+            rows = np.arange(first, last)
+            across = x + (rows + 0.5 - top) * ((other_x - x) / (bottom - top))
+            columns = np.clip(np.ceil(across - 0.5), 0, width).astype(np.int64)
+            crossed[rows, columns] ^= True
+    return np.logical_xor.accumulate(crossed, 1)[:, :width]
 
 
 def turned(
