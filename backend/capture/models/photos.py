@@ -73,7 +73,7 @@ class Photos:
         if len(parts) != 1:
             return ()
         last = parts[-1].casefold()
-        return self._by_name.get(last) or self._by_name.get(_split(last)[0], ())
+        return self._by_name.get(last) or self._by_name.get(_split(last)[0]) or ()
 
     def size(self, name: str) -> tuple[int, int]:
         """Read the width and height of a photo; raises InputError with its path."""
