@@ -45,8 +45,9 @@ Problem = Callable[[str], None]
 
 _PIXELS_AT_ONCE = 100_000_000
 """Number of pixels that may be processed at a time, with about 15 bytes for each."""
-_LARGEST_MASK = 4
-"""Largest factor by which a mask's sides may be longer than its image's, which limits the memory to read it."""
+_LARGEST = 4
+"""Largest factor by which a mask's sides may be longer than its image's, and an image's than its camera's, which limits
+the memory to read them."""
 _SMALL = 64
 """Longer side in pixels of an image that is considered small; masks of smaller ones may be as large as its."""
 _T = TypeVar("_T")
@@ -270,7 +271,12 @@ def _fitting(camera: Camera, photo: Path) -> Camera:
         size = image_size(photo)
     except InputError:
         return camera  # It is reported where the photo is read.
-    return scaled(camera, *size) if size != own and is_resized(size, own) else camera
+    is_scaled = size != own and is_resized(size, own) and not _is_far_larger(size, camera)
+    return scaled(camera, *size) if is_scaled else camera
+
+
+def _is_far_larger(size: tuple[int, int], camera: Camera) -> bool:
+    return max(size) > _LARGEST * max(camera.width, camera.height, _SMALL)
 
 
 def check_size(source: Source, size: tuple[int, int], cameras_file: Path) -> None:
@@ -298,8 +304,7 @@ def check_mask_size(source: Source) -> tuple[int, int]:
     assert source.mask_path is not None
     camera = source.camera
     width, height = mask_size(source.mask_path)
-    is_larger = max(width, height) > _LARGEST_MASK * max(camera.width, camera.height, _SMALL)
-    if is_larger or not same_shape((width, height), (camera.width, camera.height)):
+    if _is_far_larger((width, height), camera) or not same_shape((width, height), (camera.width, camera.height)):
         raise InputError(
             f"{source.mask_path} is {width}x{height} pixels, but its image {source.image_path.name} is "
             f"{camera.width}x{camera.height}; make the mask the image's size."
