@@ -28,6 +28,16 @@ def reporter() -> StoppingReporter:
     return StoppingReporter(Reporter(), StopRequest())
 
 
+class Told(Reporter):
+    """Keeps warnings."""
+
+    def __init__(self):
+        self.warnings = []
+
+    def warning(self, message):
+        self.warnings.append(message)
+
+
 def write_video(path, images, codec="libx264", form="yuv420p", rate=25, times=None, matrix=None, **tags):
     """Write images (h, w, 3) uint8 or uint16 as a video; times: in frames; matrix: of the colors, tagged or not."""
     with av.open(str(path), "w") as container:
@@ -380,7 +390,7 @@ def test_features_on_objects_are_those_of_the_present_masks(tmp_path):
         )
         for path in databases:
             path.write_bytes(b"features")
-        masks.write_object_masks(tmp_path, wanted, tmp_path / "sfm" / "masks")
+        masks.write_object_masks(tmp_path, wanted, tmp_path / "sfm" / "masks", reporter())
         return [path.exists() for path in databases]
 
     assert kept(1) == [True, True, True] == kept(1) == kept(7)
@@ -389,7 +399,7 @@ def test_features_on_objects_are_those_of_the_present_masks(tmp_path):
 
 
 def test_masks_in_a_folder_beside_photos_are_no_photos(tmp_path):
-    """Masks of converted photos get the new name, and those that were removed are removed from the capture."""
+    """Masks of converted photos get the new name, and those that were removed are named, unless others were made."""
     folder, capture = tmp_path / "toy", tmp_path / "capture"
     (folder / "masks").mkdir(parents=True)
     for name in ("1.heic", "2.jpg", "3.jpg"):
@@ -405,8 +415,10 @@ def test_masks_in_a_folder_beside_photos_are_no_photos(tmp_path):
         if made:
             (capture / "masks" / "masks.json").write_text("{}")
         photos.take_photos([capture], capture, None, reporter())
-        photos.take_photos([folder], capture, None, reporter())
-        assert (capture / "masks" / f"{number}.jpg.png").exists() == made
+        told = Told()
+        photos.take_photos([folder], capture, None, StoppingReporter(told, StopRequest()))
+        assert (capture / "masks" / f"{number}.jpg.png").exists(), "the user may have changed it"
+        assert any("is gone" in text and "2.jpg.png" in text for text in told.warnings) != made
 
 
 def test_results_in_the_folder_of_photos_are_no_photos(tmp_path):
@@ -606,13 +618,13 @@ def test_masks_for_features_have_the_size_of_the_photos(tmp_path):
     ids = np.zeros((60, 80), np.uint8)
     ids[:, 40:] = 7
     Image.fromarray(ids).save(tmp_path / "masks" / "a.png")
-    masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+    masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features", reporter())
     half, whole = (np.asarray(Image.open(tmp_path / "features" / f"{name}.jpg.png")) for name in "ab")
     assert half.shape == whole.shape == (120, 160) and (whole == 255).all()
     assert (half[:, :80] == 0).all() and (half[:, 80:] == 255).all()
     Image.fromarray(ids.T).save(tmp_path / "masks" / "a.png")
     with pytest.raises(InputError, match=r"60x80 pixels, but the photo a\.jpg is 160x120"):
-        masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features")
+        masks.write_object_masks(tmp_path, ["a.jpg", "b.jpg"], tmp_path / "features", reporter())
 
 
 def test_what_would_be_refused_at_the_end_is_refused_before_the_search_on_objects(tmp_path):
@@ -622,17 +634,19 @@ def test_what_would_be_refused_at_the_end_is_refused_before_the_search_on_object
     for name in names:
         heic(tmp_path / "images" / name)
     Image.new("L", (160, 120), 1).save(tmp_path / "masks" / "a.png")
-    with pytest.raises(InputError, match=r"b\.png is missing, as are those of 2 of 3 photos"):
-        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+    told = Told()
+    masks.write_object_masks(tmp_path, names, tmp_path / "features", told)
+    assert told.warnings[0].startswith("2 of 3 photos have no mask, for instance b.jpg")
     shutil.copy(tmp_path / "masks" / "a.png", tmp_path / "masks" / "b.png")
-    masks.write_object_masks(tmp_path, names, tmp_path / "features")
+    masks.write_object_masks(tmp_path, names, tmp_path / "features", told)
+    assert len(told.warnings) == 1
     (tmp_path / "test.txt").write_text("a.jpg\nb.heic\n")
     with pytest.raises(InputError, match=r"test\.txt names b\.heic, which is no photo"):
-        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+        masks.write_object_masks(tmp_path, names, tmp_path / "features", told)
     (tmp_path / "test.txt").unlink()
     (tmp_path / "labels.json").write_text("one name a line")
     with pytest.raises(InputError, match=r"labels\.json is not a list of labels"):
-        masks.write_object_masks(tmp_path, names, tmp_path / "features")
+        masks.write_object_masks(tmp_path, names, tmp_path / "features", told)
 
 
 def test_pixels_of_videos_are_made_square(tmp_path):

@@ -63,7 +63,7 @@ def match_photos(wanted: Wanted, source: Path, on_objects: bool, reporter: Stopp
         InputError: The photos cannot be matched, or show nothing in common from different places.
     """
     if on_objects:
-        write_object_masks(wanted.capture, wanted.names, wanted.capture / WORK / _OBJECT_MASKS)
+        write_object_masks(wanted.capture, wanted.names, wanted.capture / WORK / _OBJECT_MASKS, reporter)
     if wanted.matcher is not None and kind_of(wanted.matcher) == LOFTR:
         path = _match_places(wanted, wanted.matcher, on_objects, reporter)
     else:

@@ -89,7 +89,7 @@ def _is_missing(target: Path, path: Path, capture: Path, stamps: Stamps) -> bool
     return not target.exists() or (has_changed and not is_made(capture / MASKS))
 
 
-def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> None:
+def write_object_masks(capture: Path, names: Sequence[str], folder: Path, reporter: Reporter) -> None:
     """Write for each photo of a capture where features may be: on objects, or everywhere without a mask.
 
     If a mask is another than before, the features on objects are forgotten.
@@ -98,6 +98,7 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
         capture: the capture, with masks/.
         names: the photos.
         folder: receives NAME.png, black where there is no object.
+        reporter: receives a warning if many photos have no mask.
 
     Raises:
         InputError: No photo has a mask, one cannot be read, or the finished capture could not be.
@@ -106,7 +107,14 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
     found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
     if not found:
         raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
-    _require_readable(capture, names, [name for name in names if name not in found])
+    _require_readable(capture, names)
+    unmasked = [name for name in names if name not in found]
+    if 2 * len(unmasked) > len(names) and not is_made(capture / MASKS):
+        # Those without a mask may get no pose, and then do not count.
+        reporter.warning(
+            f"{len(unmasked)} of {len(names)} photos have no mask, for instance {unmasked[0]}; the capture cannot be "
+            "used if that holds for more than half of those with a pose."
+        )
     for name in names:
         size = image_size(capture / IMAGES / name)
         ids = read_mask(found[name]) if name in found else np.ones((1, 1), np.uint8)
@@ -130,14 +138,8 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path) -> Non
         write_atomic(target, buffer.getvalue())
 
 
-def _require_readable(capture: Path, names: Sequence[str], unmasked: Sequence[str]) -> None:
+def _require_readable(capture: Path, names: Sequence[str]) -> None:
     """Raise InputError for what would only be refused after hours, when the finished capture is read."""
-    # Those without a mask may get no pose, and then do not count.
-    if len(names) - len(unmasked) < 2 and not is_made(capture / MASKS):
-        first = capture / MASKS / Path(unmasked[0]).with_suffix(".png")
-        raise InputError(
-            f"The mask {first} is missing, as are those of {len(unmasked)} of {len(names)} photos; add them."
-        )
     read_names(capture)
     unknown = [name for name in read_held_out(capture) or () if name not in names]
     if unknown:
