@@ -142,6 +142,9 @@ def survey_capture(
     masks = Files(masks_folder) if masks_folder.is_dir() and not photos_only else None
     total, absent = len(model.images) + len(model.absent), list(model.absent)
     sources, unmasked, resized = [], [], []
+    paths = {path for image in model.images if (path := files.find(image.name)) is not None}
+    with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
+        sizes = dict(zip(paths, pool.map(_size_of, paths), strict=True))
     for image in sorted(model.images, key=lambda image: image.name):
         if re.match(r"[/\\]|[A-Za-z]:", image.name) or ".." in re.split(r"[/\\]", image.name):
             problem(
@@ -163,7 +166,7 @@ def survey_capture(
         camera = model.cameras[image.camera_id]
         if target_of(camera) is None:
             continue
-        fitting = _fitting(camera, path)
+        fitting = _fitting(camera, sizes[path])
         if fitting != camera:
             resized.append((image.name, fitting, camera))
             image = replace(image, xy=image.xy * [fitting.width / camera.width, fitting.height / camera.height])
@@ -264,13 +267,19 @@ def _is_color_coded(sources: list[Source], problem: Problem) -> bool:
     return False
 
 
-def _fitting(camera: Camera, photo: Path) -> Camera:
-    """Return an image's camera, scaled to a photo that was reduced or enlarged, but not cropped."""
-    own = camera.width, camera.height
+def _size_of(photo: Path) -> tuple[int, int] | None:
+    """Return the size of a photo; None if it cannot be read, which is reported where all of it is."""
     try:
-        size = image_size(photo)
+        return image_size(photo)
     except InputError:
-        return camera  # It is reported where the photo is read.
+        return None
+
+
+def _fitting(camera: Camera, size: tuple[int, int] | None) -> Camera:
+    """Return an image's camera, scaled to the size of a photo that was reduced or enlarged, but not cropped."""
+    own = camera.width, camera.height
+    if size is None:
+        return camera
     is_scaled = size != own and is_resized(size, own) and not _is_far_larger(size, camera)
     return scaled(camera, *size) if is_scaled else camera
 

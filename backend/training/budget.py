@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,8 +26,9 @@ WARM_UP = 600
 plateau. During the warm-up, the error decreases faster than later. Earlier growth would result in more anchors, but no
 better quality."""
 
-LOOKAHEAD, WORTHWHILE_DB = 1000, 0.2
-"""A training has converged when this number of further steps would gain less than this number of dB."""
+LOOKAHEAD, WORTHWHILE_DB, _WORTHWHILE_BEFORE = 1000, 0.2, 0.36
+"""A training has converged when this number of further steps would gain less than this number of dB; the last number is
+that of earlier versions."""
 
 OCTAVES, MIN_OCTAVES = 2, 1.25
 """The gain of further steps is extrapolated from the evaluations in the latest octaves of steps (an octave doubles the
@@ -41,6 +42,8 @@ VALIDATE_EVERY, MAX_VALIDATION_VIEWS, MIN_TRAINED_VIEWS = 8, 20, 16
 """A training until convergence validates on every 8th training view, at most on this number. None is spared if fewer
 than the third number of views would be left to train on: the few that could be would cost the model more than they
 tell about it."""
+
+_JOINED = ", joined"
 
 DECAY_FROM, _DECAY_FROM_BEFORE = 0.8, 0.9
 """Fraction of its steps at which a training until convergence leaves the plateau of the learning rates; after that, it
@@ -99,9 +102,10 @@ class TrainingProgress:
         self.queue += validation
         return True
 
-    def resume_plateau(self) -> None:
-        """Go on as if the plateau had not ended: the validation views decide again."""
-        self.converged_at, self.ends_at, self.limited, self.joined = 0, 0, False, False
+    def leave(self) -> None:
+        """Train without the validation views again, since they decide on the end."""
+        if self.joined:
+            self.joined, self.queue = False, []
 
     @property
     def causes(self) -> str:
@@ -189,8 +193,14 @@ class Budget:
         if self.until_converged:
             # Stops must not delay evaluations, which decide when the training ends.
             p.evaluated = int(p.curve[-1]["step"]) if p.curve else 0
+            if p.converged_at and not p.ends_at:
+                # Of an earlier version, which did not note why the plateau ended.
+                before = convergence_step([e for e in p.curve if e["step"] <= p.converged_at], _WORTHWHILE_BEFORE)
+                p.limited = bool(p.curve) and (before is None or p.converged_at < before)
             if p.limited and not self._is_limited(p):
-                p.resume_plateau()
+                p.converged_at, p.ends_at, p.limited = 0, 0, False
+            if not p.converged_at:
+                p.leave()
         else:
             p.evaluated = bisect_right(_EVALUATIONS, self.progress(p))
 
@@ -235,7 +245,12 @@ class Budget:
 
 def objective_of(p: TrainingProgress, downscale: int) -> str:
     """Return a name of what the loss is measured on: images reduced by a factor, of some views, of some splats."""
-    return f"1/{downscale}, {len(p.watched)} spared, {p.dropped:g} dropped{', joined' if p.joined else ''}"
+    return f"1/{downscale}, {len(p.watched)} spared, {p.dropped:g} dropped{_JOINED if p.joined else ''}"
+
+
+def _is_joined(entry: Mapping[str, Any]) -> bool:
+    """Return whether the validation views were trained on, too, at an entry of the curve."""
+    return str(entry.get("objective")).endswith(_JOINED)
 
 
 def plateau_end(p: TrainingProgress) -> str:
@@ -276,11 +291,11 @@ def expected_end(p: TrainingProgress) -> float | None:
     return None if converged is None else max(converged, p.step) / DECAY_FROM
 
 
-def convergence_step(curve: list[dict[str, Any]]) -> float | None:
-    """Extrapolate the step from which on `LOOKAHEAD` further steps gain less than `WORTHWHILE_DB`.
+def convergence_step(curve: list[dict[str, Any]], worthwhile: float = WORTHWHILE_DB) -> float | None:
+    """Extrapolate the step from which on `LOOKAHEAD` further steps gain less than `worthwhile` dB.
 
     Assuming that further octaves of steps gain as many dB as the latest ones, it is the step n for which
-    octave * log2(1 + LOOKAHEAD / n) = WORTHWHILE_DB.
+    octave * log2(1 + LOOKAHEAD / n) = worthwhile.
 
     Returns:
         The step; 0 if an octave gains nothing, None if the curve is too short for an estimate.
@@ -289,7 +304,7 @@ def convergence_step(curve: list[dict[str, Any]]) -> float | None:
     if octave is None:
         return None
     # Treat a negligible gain as none.
-    return LOOKAHEAD / (2 ** (WORTHWHILE_DB / octave) - 1) if octave > WORTHWHILE_DB / 100 else 0.0
+    return LOOKAHEAD / (2 ** (worthwhile / octave) - 1) if octave > worthwhile / 100 else 0.0
 
 
 def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
@@ -309,6 +324,8 @@ def _gain_per_octave(curve: list[dict[str, Any]]) -> float | None:
     """
     last = curve[-1]["step"] if curve else 0
     recent = [entry for entry in curve if entry["step"] >= max(WARM_UP, last / 2**OCTAVES)]
+    # Entries of an earlier decay, when the validation views were trained on, tell nothing of the plateau.
+    recent = [entry for entry in recent if _is_joined(entry) == _is_joined(curve[-1])]
     validated = all(entry.get("validation_psnr") is not None for entry in recent)
     key = "validation_psnr" if validated else "loss_db"
     if not validated:

@@ -70,9 +70,10 @@ def set_up_compositor(
 
 
 def _shows_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
-    """Return whether the compositor of another scene shows frames of a folder."""
+    """Return whether the compositor of another scene, which scenes may share, shows frames of a folder."""
+    own = _tree_if_any(scene)
     trees = (_tree_if_any(other) for other in bpy.data.scenes if other != scene)
-    nodes = (_image_node(tree) for tree in trees if tree is not None)
+    nodes = (_image_node(tree) for tree in trees if tree is not None and tree != own)
     return any(node is not None and _path(node.image).parent == folder for node in nodes)
 
 

@@ -42,8 +42,10 @@ class CleanUpLabels(bpy.types.Operator):
         )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        named = next(iter(results.roots_of(Path(self.folder))), None) if self.folder else None
-        root = named or need.active_root(context)
+        root = next(iter(results.roots_of(Path(self.folder))), None) if self.folder else need.active_root(context)
+        if root is None:
+            self.report({"ERROR"}, f"The reconstruction in {self.folder} is not in this file any more")
+            return {"CANCELLED"}
         folder = scene.folder_of(root)
         job = locations.backend_job(f"Labels of {root.name}", "label", folder, "clean-labels", str(folder))
         return background.submit(job, context.scene, self.report)

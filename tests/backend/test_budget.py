@@ -98,9 +98,9 @@ def test_greater_time_limit_continues_the_plateau():
     assert p.converged_at and limited.progress(p) == 1 and plateau_end(p).startswith("The time limit is near")
     limited.begin(p)
     assert p.converged_at, "the same limit"
-    p.joined = True
+    p.joined, p.queue = True, [1]
     longer.begin(p)
-    assert not p.converged_at and not p.joined and longer.progress(p) < PLATEAU_UNTIL
+    assert not p.converged_at and not p.joined and not p.queue and longer.progress(p) < PLATEAU_UNTIL
     done = walk(PRESETS["final"], lambda step: 30.0)
     assert plateau_end(done).startswith("The training has converged")
     PRESETS["final"].begin(done)
@@ -108,6 +108,17 @@ def test_greater_time_limit_continues_the_plateau():
     earlier = TrainingProgress(step=2000, converged_at=1800)
     PRESETS["final"].begin(earlier)
     assert PRESETS["final"].progress(earlier) == 1, "what an earlier version has ended stays so"
+    earlier.curve = curve_of(range(WARM_UP, 1801, 100), lambda step: math.log2(step))
+    PRESETS["final"].begin(earlier)
+    assert not earlier.converged_at, "but for its limit"
+
+
+def test_entries_of_a_decay_tell_nothing_of_the_plateau():
+    steps = range(WARM_UP, 4 * WARM_UP, 100)
+    plateau = curve_of(steps, lambda s: 0.7 * math.log2(s), objective="a")
+    decay = [{"step": s, "loss_db": 50.0, "objective": "a, joined"} for s in (2350, 2380)]
+    after = curve_of([2400], lambda s: 0.7 * math.log2(s), objective="a")
+    assert convergence_step([*plateau, *decay, *after]) == pytest.approx(converged_after(0.7))
 
 
 def test_validation_views_join_once():

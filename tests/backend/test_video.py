@@ -421,6 +421,21 @@ def test_masks_in_a_folder_beside_photos_are_no_photos(tmp_path):
         assert any("is gone" in text and "2.jpg.png" in text for text in told.warnings) != made
 
 
+def test_mask_that_replaces_one_of_another_name_is_used(tmp_path):
+    folder, capture = tmp_path / "toy", tmp_path / "capture"
+    (folder / "masks").mkdir(parents=True)
+    for name in ("1.jpg", "2.jpg"):
+        heic(folder / name)
+    Image.new("L", (160, 120), 1).save(folder / "masks" / "1.jpg.png")
+    photos.take_photos([folder], capture, None, reporter())
+    (folder / "masks" / "1.jpg.png").unlink()
+    Image.new("L", (160, 120), 2).save(folder / "masks" / "1.png")
+    told = Told()
+    photos.take_photos([folder], capture, None, StoppingReporter(told, StopRequest()))
+    assert sorted(path.name for path in (capture / "masks").iterdir()) == ["1.jpg.png.old", "1.png"]
+    assert not told.warnings
+
+
 def test_results_in_the_folder_of_photos_are_no_photos(tmp_path):
     folder = tmp_path / "trip"
     for name in ("a.jpg", "day/b.jpg", "room/images/c.jpg", "room-splats/cache/d.png"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -66,13 +66,30 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
                 shutil.copyfile(path, part)
 
 
-def warn_of_gone(capture: Path, stamps: Stamps, reporter: Reporter) -> None:
+def warn_of_gone(photos: Iterable[str], capture: Path, stamps: Stamps, reporter: Reporter) -> None:
     """Say which masks of the capture do not exist beside the photos any more, unless others were made of them.
 
-    They are not deleted, since the user may have changed them there.
+    They are not deleted, since the user may have changed them there. Where a photo has another mask now, which they
+    would hide, `.old` is added to their names.
+
+    Args:
+        photos: the names of the photos.
+        capture: the capture.
+        stamps: of the copies.
+        reporter: receives the warning.
     """
+    if is_made(capture / MASKS):
+        return
     gone = [name for name in stamps.masks_not_asked_for() if (capture / name).exists()]
-    if gone and not is_made(capture / MASKS):
+    replaced = set()
+    for photo in photos if gone else ():
+        own = [f"{MASKS}/{name}" for name in mask_names(photo)[0]]
+        if any(stamps.is_asked_for(name) for name in own):
+            replaced.update(set(own) & set(gone))
+    for name in replaced:
+        (capture / name).replace(capture / f"{name}.old")
+    gone = [name for name in gone if name not in replaced]
+    if gone:
         count = "a mask" if len(gone) == 1 else f"{len(gone)} masks"
         reporter.warning(
             f"The original of {count} in {capture / MASKS} is gone, such as that of {Path(gone[0]).name}; delete the "

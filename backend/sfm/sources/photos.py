@@ -183,7 +183,7 @@ def take_photos(
         masks = MaskFiles(base, names, base)
         write_masks(masks, masks.photos, names, capture, stamps)
     if not from_copies and not in_place:
-        warn_of_gone(capture, stamps, reporter)
+        warn_of_gone(names.values(), capture, stamps, reporter)
     stamps.write()
     return Taken(photos, unreadable, not files)
 

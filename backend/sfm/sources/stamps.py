@@ -34,6 +34,10 @@ class Stamps:
         gone = sorted(name for name in self._known.keys() - self._now.keys() if name.startswith(f"../{MASKS}/"))
         return [name.removeprefix("../") for name in gone if PurePosixPath(name).parts.count("..") == 1]
 
+    def is_asked_for(self, name: str) -> bool:
+        """Return whether the original of a path in the capture was asked for now."""
+        return f"../{name}" in self._now
+
     def write(self) -> None:
         """Write the file, with what was asked for now or earlier."""
         make_folder(self._path.parent)

@@ -68,10 +68,9 @@ def begin_with_labels(
     """
     tensors, state, _ = require_checkpoint(checkpoint)
     state = {**state, "supervise_background": supervise_background}
-    state["progress"] = {**state["progress"], "watched": [], "grown": False}
-    trainer = Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
-    trainer.progress.resume_plateau()
-    return trainer
+    plateau = {"watched": [], "grown": False, "converged_at": 0, "ends_at": 0, "limited": False}
+    state["progress"] = {**state["progress"], **plateau}
+    return Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
 
 
 def relabeled(
