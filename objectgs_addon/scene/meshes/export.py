@@ -73,7 +73,7 @@ def export(
         )
     if per_object and out.is_file():
         raise InputError(f"{out} is a file; choose another name for the folder.")
-    parts_by_name: dict[int, tuple[str, list[tuple[bpy.types.Collection, bpy.types.Object]]]] = {
+    named_parts: dict[int, tuple[str, list[tuple[bpy.types.Collection, bpy.types.Object]]]] = {
         object_id: (
             collections[object_id].name,
             [
@@ -85,10 +85,10 @@ def export(
         )
         for object_id in chosen
     } or {number: (mesh.name, [(root, mesh)]) for number, mesh in enumerate(whole)}
-    parts_of = {out: [part for _, parts in parts_by_name.values() for part in parts]}
+    parts_of = {out: [part for _, parts in named_parts.values() for part in parts]}
     if per_object:
-        stems = distinct_stems({key: name for key, (name, _) in parts_by_name.items()})
-        parts_of = {out / f"{stem}.{suffix}": parts_by_name[key][1] for key, stem in stems.items()}
+        stems = distinct_stems({key: name for key, (name, _) in named_parts.items()})
+        parts_of = {out / f"{stem}.{suffix}": named_parts[key][1] for key, stem in stems.items()}
     for path in parts_of:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
     if in_capture:
