@@ -8,3 +8,7 @@ import sys
 # block each other's cores, so there they sleep. The libraries read this once, when they are loaded.
 if sys.platform != "linux":
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# The wheels of torch and pycolmap for macOS contain a copy of OpenMP each. The second one that starts would end the
+# process; both may start, since only one of them computes with several threads (see backend/sfm/worker.py).
+if sys.platform == "darwin":
+    os.environ.setdefault("KMP_DUPLICATE_LIB_OK", "TRUE")

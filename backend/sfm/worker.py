@@ -341,6 +341,8 @@ STAGES: dict[str, Callable[..., None]] = {
     "global": map_globally,
     "refine": refine,
 }
+_OF_NETWORKS = ("extract-learned", "match-learned", "match-places")
+"""Those that import torch."""
 
 
 def _end_with(parent: int) -> None:
@@ -355,8 +357,9 @@ def main(threads: str, name: str, *arguments: str) -> None:
     """Run a stage with a number of threads."""
     global _threads
     _threads = int(threads)
-    # Before torch is imported, for the networks.
-    os.environ["OMP_NUM_THREADS"] = threads
+    # Before torch is imported, for the networks. On macOS, torch and pycolmap have an OpenMP each, whose threads may
+    # crash beside those of the other.
+    os.environ["OMP_NUM_THREADS"] = "1" if sys.platform == "darwin" and name in _OF_NETWORKS else threads
     threading.Thread(target=_end_with, args=(take_stdin(),), daemon=True).start()
     pycolmap.logging.minloglevel = _ERRORS
     STAGES[name](*arguments)

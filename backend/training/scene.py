@@ -87,6 +87,7 @@ class Scene:
         self._lock = threading.Lock()
         self._coming: dict[_Key, Future[_Stored]] = {}
         self.read_ahead = 1 if device.type == "cpu" else _READ_AHEAD_ON_GPU
+        # Readers run no kernels: where numba has its own threads, as on macOS, kernels of two threads end the process.
         self._readers = ThreadPoolExecutor(self.read_ahead, "read-ahead")
 
     def camera(self, index: int, downscale: int = 1) -> Camera:

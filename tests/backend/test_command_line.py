@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,3 +25,14 @@ def test_help_and_version_import_no_compute_packages(words):
     )
     assert ran.returncode == 0 and ran.stdout
     assert not HEAVY & set(ran.stderr.split())
+
+
+@pytest.mark.parametrize(("system", "value"), [("darwin", "TRUE"), ("linux", None), ("win32", None)])
+def test_torch_and_pycolmap_may_each_have_an_openmp_on_macos(system, value):
+    """Their wheels contain one each, and the second that starts would end the process."""
+    code = f"import os, sys; sys.platform = {system!r}; import backend; print(os.environ.get('KMP_DUPLICATE_LIB_OK'))"
+    environment = {name: text for name, text in os.environ.items() if name != "KMP_DUPLICATE_LIB_OK"}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parents[2], env=environment, capture_output=True, text=True
+    )
+    assert ran.stdout == f"{value}\n", ran.stderr

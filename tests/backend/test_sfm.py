@@ -591,6 +591,17 @@ def test_stage_ends_with_the_process_that_began_it():
     process.stdout.close()
 
 
+@pytest.mark.parametrize(("stage", "threads"), [("match", "4"), ("match-learned", "1")])
+def test_networks_have_one_thread_on_macos(stage, threads):
+    """The threads of torch and pycolmap, which have an OpenMP each there, may crash beside each other."""
+    program = (
+        "import os, sys; from backend.sfm import worker; sys.platform = 'darwin'; "
+        f"worker.STAGES[{stage!r}] = lambda: print(os.environ['OMP_NUM_THREADS']); worker.main('4', {stage!r})"
+    )
+    ran = subprocess.run([sys.executable, "-c", program], cwd=stages._ROOT, capture_output=True, text=True)
+    assert ran.stdout == f"{threads}\n", ran.stderr
+
+
 def test_masks_and_names_that_cannot_be_used_do_not_stop_the_search_for_points(write_capture, tmp_path):
     scene = write_capture(views=6, size=(48, 36))
     for path in sorted((scene.folder / "masks").iterdir())[1:]:
