@@ -45,7 +45,7 @@ def new_masks(capture: Path, kept: Path | None = None) -> Iterator[Path]:
     folder = capture / "masks"
     part, old = (capture / f"{PART_PREFIX}{name}{PART_SUFFIX}" for name in ("masks", "masks-old"))
     if old.exists() and not folder.exists():
-        old.rename(folder)  # An earlier run was killed in between.
+        replace_file(old, folder)  # An earlier run was killed in between.
     for left in (part, old):
         shutil.rmtree(left, ignore_errors=True)
     part.mkdir()
@@ -57,11 +57,13 @@ def new_masks(capture: Path, kept: Path | None = None) -> Iterator[Path]:
             replace_file(part, folder)
         except OSError:
             if (kept or old).exists():
-                (kept or old).rename(folder)
+                replace_file(kept or old, folder)
             raise
     finally:
-        for left in (part, old):
-            shutil.rmtree(left, ignore_errors=True)
+        shutil.rmtree(part, ignore_errors=True)
+        # What could not be put back is there for the next run.
+        if folder.exists():
+            shutil.rmtree(old, ignore_errors=True)
 
 
 def write_mask(folder: Path, name: str, mask: np.ndarray) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 
 from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.events import Reporter, StagedReporter
-from ...backend.shared.formats.atomic import make_folder, recorded
+from ...backend.shared.formats.atomic import make_folder, recorded, replace_file
 from . import files, mask_noise, points, scene
 from .render import Renderer
 
@@ -167,12 +167,12 @@ def _swap(part: Path, out: Path) -> None:
     """Move the finished folder into place; the old one is deleted only after that succeeds."""
     old = _beside(out)
     if out.exists():
-        out.rename(old)
+        replace_file(out, old)
     try:
-        part.rename(out)
+        replace_file(part, out)
     except OSError:
         if old.exists():
-            old.rename(out)
+            replace_file(old, out)
         raise
     shutil.rmtree(old, ignore_errors=True)
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...backend.shared.formats.atomic import replace_file
 from ..process.backend_process import backend_environment
 from ..process.jobs import Job
 from .extension import ROOT
@@ -178,7 +179,8 @@ def remove(folder: str | Path) -> None:
     if not layout.is_ours(folder) or not own.issuperset(path.name for path in folder.iterdir()):
         raise OSError(errno.ENOTEMPTY, "it contains files that are not ObjectGS's", str(folder))
     away = folder.with_name(f"{folder.name}{layout.REMOVED}{os.getpid()}-{next(_removed)}")
-    folder.rename(away)
+    # A process that was ended just now may not have let go of its files yet, on Windows.
+    replace_file(folder, away)
     threading.Thread(target=_finish_removing, args=(away,), daemon=True).start()
 
 

@@ -16,6 +16,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.shared.errors import Cancelled, InputError
+from objectgs.backend.shared.formats import atomic
 from objectgs.objectgs_addon.demo import capture as demo_capture
 from objectgs.objectgs_addon.demo import mask_noise
 
@@ -253,3 +254,22 @@ def test_foreign_files_are_kept(tiny, tmp_path, monkeypatch):
     assert (out / "images" / "holiday.jpg").read_text() == "not yours"
     assert all((tmp_path / name / "thesis.odt").read_text() == "not yours" for name in ("demo.part", "demo.old"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["demo", "demo.old", "demo.part"]
+
+
+def test_renders_are_kept_while_another_program_reads_them(tiny, tmp_path, monkeypatch):
+    """On Windows, a folder cannot be renamed while a virus scanner has one of its files open."""
+    refused, rename = set(), Path.replace
+
+    def busy(self, target):
+        if self not in refused:
+            refused.add(self)
+            raise PermissionError(13, "in use")
+        return rename(self, target)
+
+    monkeypatch.setattr(demo_capture, "_fill", lambda part, *_: shutil.copytree(tiny, part, dirs_exist_ok=True))
+    monkeypatch.setattr(Path, "replace", busy)
+    monkeypatch.setattr(atomic, "_PATIENCE", 1.0)
+    for settings in (TINY, replace(TINY, seed=5)):
+        out = demo_capture.make(tmp_path / "demo", settings, overwrite=True)
+    assert len(refused) == 3 and [path.name for path in tmp_path.iterdir()] == ["demo"]
+    assert (out / "truth" / "objects.json").is_file()

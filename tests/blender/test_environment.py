@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from objectgs.backend.shared.formats import atomic
 from objectgs.objectgs_addon.environment import environment
 from objectgs.objectgs_addon.environment.worker import checks, choice, events, layout, pip, programs, setup
 from objectgs.objectgs_addon.process import backend_process
@@ -600,6 +601,24 @@ def test_environment_in_use_is_kept(root, monkeypatch):
     with setup.claimed(folder):
         assert environment.inspect(folder).state == "incomplete"
     assert [path.name for path in folder.iterdir()] == [layout.STAMP]
+
+
+def test_removal_waits_for_a_process_that_was_ended(root, monkeypatch):
+    """Windows lets go of its files a moment after that."""
+    folder, rename, refused = root / "environment", Path.replace, []
+    folder.mkdir()
+    (folder / layout.STAMP).write_text("")
+
+    def busy(self, target):
+        if not refused:
+            refused.append(target)
+            raise PermissionError(13, "Access is denied")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", busy)
+    monkeypatch.setattr(atomic, "_PATIENCE", 1.0)
+    environment.remove(folder)
+    assert refused and environment.inspect(folder).state == "absent"
 
 
 def make(folder, text):
