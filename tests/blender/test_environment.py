@@ -583,6 +583,35 @@ def test_missing_runtime_of_windows_is_named(monkeypatch):
         checks.check_runtime()
 
 
+@pytest.mark.parametrize(
+    ("system", "base", "flags", "sentence"),
+    [
+        ("darwin", "/private/var/folders/x/T/AppTranslocation/A1/d/Blender.app/python3.11", 0, "into Applications"),
+        ("darwin", "/Volumes/Blender/Blender.app/python3.11", os.ST_RDONLY, "into Applications"),
+        ("darwin", "/Volumes/Disk/Blender.app/python3.11", 0, None),
+        ("darwin", "/usr/bin/python3", os.ST_RDONLY, None),
+        ("linux", "/Volumes/Blender/python3.11", os.ST_RDONLY, None),
+        (
+            "win32",
+            r"C:\Users\me\AppData\Local\Microsoft\WindowsApps\PythonSoftwareFoundation.Python.3.11_q\python.exe",
+            0,
+            "Microsoft Store.*clear",
+        ),
+        ("win32", r"C:\Program Files\WindowsApps\BlenderFoundation.Blender4.5LTS_p\python\python.exe", 0, None),
+    ],
+)
+def test_python_in_a_place_that_does_not_last_is_rejected(monkeypatch, system, base, flags, sentence):
+    """Blender itself from the Microsoft Store sees what its own Python writes."""
+    monkeypatch.setattr(checks.sys, "platform", system)
+    monkeypatch.setattr(checks.sys, "_base_executable", base)
+    monkeypatch.setattr(checks.os, "statvfs", lambda _: SimpleNamespace(f_flag=flags))
+    if sentence is None:
+        checks.check_place()
+        return
+    with pytest.raises(events.Refused, match=sentence):
+        checks.check_place()
+
+
 def test_environment_in_use_is_kept(root, monkeypatch):
     """Windows refuses to rename a folder with a loaded library."""
     folder = root / "environment"

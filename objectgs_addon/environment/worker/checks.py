@@ -7,6 +7,7 @@ import argparse
 import ctypes
 import importlib.metadata
 import json
+import os
 import platform
 import shutil
 import struct
@@ -34,6 +35,28 @@ def check_python() -> None:
         )
     if struct.calcsize("P") != 8:
         raise Refused(f"{sys.executable} is a 32-bit Python, and the backend needs a 64-bit one; choose another.")
+
+
+def check_place() -> None:
+    """Raise Refused if this Python will be elsewhere later, or if Blender would not see the files that it writes."""
+    base = getattr(sys, "_base_executable", None) or sys.executable
+    if sys.platform == "darwin" and ("/AppTranslocation/" in base or _is_on_disk_image(base)):
+        # An environment consists of links to this path.
+        raise Refused(
+            f"macOS runs Blender from a temporary place ({base}), where the backend would not find it later; move "
+            "Blender into Applications with Finder, start it from there, and try again."
+        )
+    if sys.platform == "win32" and "\\WindowsApps\\PythonSoftwareFoundation.Python." in f"{base} {sys.base_prefix}":
+        # Windows redirects what such a Python writes to the user's folder of settings.
+        raise Refused(
+            f"{sys.executable} is from the Microsoft Store, and Blender does not see the files that such a Python "
+            "writes; choose a Python from python.org as Base Python, or clear that setting."
+        )
+
+
+def _is_on_disk_image(path: str) -> bool:
+    """Return whether a path of macOS is on a disk image, which cannot be written to, unlike most external disks."""
+    return path.startswith("/Volumes/") and bool(os.statvfs(path).f_flag & os.ST_RDONLY)
 
 
 def check_can_make_environments() -> None:

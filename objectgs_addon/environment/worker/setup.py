@@ -21,6 +21,7 @@ from .checks import (
     KERNEL_SECONDS,
     check_backend,
     check_can_make_environments,
+    check_place,
     check_python,
     check_runtime,
     check_space,
@@ -48,6 +49,7 @@ def set_up(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
     """
     folder, device = options.folder.absolute(), options.device
     check_python()
+    check_place()
     check_can_make_environments()
     check_runtime()
     check_space(folder, device)
