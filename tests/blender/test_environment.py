@@ -509,6 +509,14 @@ def test_probe_rejects_other_programs(root, program):
             "virus scanner",
         ),
         (
+            [
+                "WARNING: Retrying (Retry(total=0)) after connection broken by "
+                "'SSLError(SSLCertVerificationError('A certificate chain processed, but terminated in a root'))'",
+                "ERROR: No matching distribution found for numpy==2.4.6",
+            ],
+            "virus scanner",
+        ),
+        (
             ["ERROR: Exception:", "Traceback (most recent call last):", "ProtocolError: Connection broken: 10053"],
             "could not be reached",
         ),
@@ -525,6 +533,39 @@ def test_probe_rejects_other_programs(root, program):
 )
 def test_pip_failures_are_explained(lines, sentence):
     assert sentence in pip.why_pip_failed(lines)
+
+
+@pytest.mark.parametrize(
+    ("version", "has_truststore", "features"),
+    [
+        ("24.0", True, [None, "truststore", "truststore"]),
+        ("23.2.1", False, [None, None]),
+        ("24.2", True, [None, None]),
+        ("25.3", True, [None, None]),
+    ],
+)
+def test_certificates_that_the_system_trusts_are_tried(tmp_path, monkeypatch, version, has_truststore, features):
+    """The pip that comes with Python 3.11 knows only those of its own list unless it is told to."""
+    (tmp_path / f"pip-{version}.dist-info").mkdir()
+    (tmp_path / f"pip-{version}.dist-info" / "METADATA").write_text(f"Name: pip\nVersion: {version}\n")
+    if has_truststore:
+        (tmp_path / "pip" / "_vendor" / "truststore").mkdir(parents=True)
+    used = []
+
+    def run_pip(_command, _stop, on_line, _on_tick, environment):
+        used.append(environment.get("PIP_USE_FEATURE"))
+        if used[-1] is None:
+            on_line("WARNING: Retrying: SSLError(SSLCertVerificationError(1, '[SSL: CERTIFICATE_VERIFY_FAILED] ...'))")
+            on_line("ERROR: No matching distribution found for torch==2.13.0")
+            return 1
+        on_line("torch (2.13.0+cpu)")
+        return 0
+
+    monkeypatch.delenv("PIP_USE_FEATURE", raising=False)
+    monkeypatch.setattr(pip, "run", run_pip)
+    installer = pip.Pip(Path(sys.executable), tmp_path, tmp_path, SimpleNamespace(), lambda: False)
+    found = [installer.offers("torch==2.13.0", "cpu") for _ in range(2)]
+    assert (found, used) == ([len(features) == 3] * 2, features)
 
 
 def test_download_of_a_local_version_is_found(root):

@@ -23,6 +23,8 @@ _BROKEN = (
     "incomplete-download",
 )  # fmt: skip
 """What pip says where a connection ended during a download."""
+_DISTRUSTED = re.compile("CERTIFICATE_VERIFY_FAILED|SSLCertVerificationError")
+"""What pip says where a certificate is not accepted, by its own list and by that of the system."""
 
 
 class Pip:
@@ -40,6 +42,7 @@ class Pip:
         self.python, self.site, self.temporary = python, site, temporary
         self.progress, self.stop = progress, stop
         self.lines: list[str] = []
+        self._trusts_system = False
 
     @classmethod
     def of_environment(cls, folder: Path, progress: Progress, stop: Callable[[], bool]) -> Pip:
@@ -89,6 +92,21 @@ class Pip:
         return any(re.search(rf"\b{re.escape(version)}\+{build}", line) for line in self.lines)
 
     def _run(self, arguments: list[str], on_tick: Callable[[], None] = lambda: None) -> int:
+        """Run pip; if its own list of certificates lacks one, once more and from then on with that of the system."""
+        code = self._run_once(arguments, on_tick)
+        is_distrusted = code != 0 and any(map(_DISTRUSTED.search, self.lines))
+        if not is_distrusted or self._trusts_system or not self._can_trust_system():
+            return code
+        self._trusts_system = True
+        print_error("Trying again with the certificates that the system trusts")
+        return self._run_once(arguments, on_tick)
+
+    def _can_trust_system(self) -> bool:
+        """Return whether this pip can use the system's certificates and does not by itself: 23.3 to 24.1."""
+        version = tuple(map(int, re.findall(r"\d+", self.packages.get("pip", ""))[:2]))
+        return version < (24, 2) and (self.site / "pip" / "_vendor" / "truststore").is_dir()
+
+    def _run_once(self, arguments: list[str], on_tick: Callable[[], None]) -> int:
         self.lines = []
         # Temporary files can exceed the space in /tmp. `user = true` in pip's configuration fails in environments.
         folder = str(self.temporary)
@@ -99,6 +117,8 @@ class Pip:
             "PIP_USER": "0",
             "PIP_DISABLE_PIP_VERSION_CHECK": "1",
         }
+        if self._trusts_system:
+            environment["PIP_USE_FEATURE"] = f"{os.environ.get('PIP_USE_FEATURE', '')} truststore".strip()
         return run(guarded(self.python, "pip", *arguments), self.stop, self._line, on_tick, environment)
 
     def _line(self, line: str) -> None:
@@ -153,7 +173,7 @@ def why_pip_failed(lines: list[str]) -> str:
     broken = any(words in failure for words in _BROKEN)
     if "No space left on device" in text or "not enough space on the disk" in text:
         return "The disk is full; make room and try again."
-    if "CERTIFICATE_VERIFY_FAILED" in (text if lacking else failure):
+    if _DISTRUSTED.search(text if lacking else failure):
         return (
             "The certificate of Python's package index is not accepted, as happens where a virus scanner or a proxy "
             "reads encrypted connections, or the clock is wrong; allow this connection there, or name the proxy's "
