@@ -388,6 +388,20 @@ def test_next_setup_deletes_remains_of_removal(root):
         assert not old.exists()
 
 
+def test_remains_that_are_in_use_do_not_end_a_setup(root, monkeypatch):
+    """Blender may be deleting them at the same time, so that files vanish."""
+    old = root / "environment.removed-7-0"
+    old.mkdir()
+    (old / layout.STAMP).write_text("")
+
+    def vanished(_):
+        raise FileNotFoundError(2, "No such file or directory")
+
+    monkeypatch.setattr(layout, "remove_own", vanished)
+    with setup.claimed(root / "environment"):
+        assert old.exists()
+
+
 def test_unsuitable_pythons_are_rejected(root, monkeypatch):
     options = argparse.Namespace(folder=root / "environment", requirements=root / "requirements", device="cpu")
 
@@ -495,6 +509,15 @@ def test_probe_rejects_other_programs(root, program):
                 "ERROR: No matching distribution found for numpy==2.4.6",
             ],
             "could not be reached",
+        ),
+        (
+            [
+                "WARNING: pip is configured with locations that require TLS/SSL, however the ssl module in Python is "
+                "not available.",
+                "Could not fetch URL https://pypi.org/simple/: There was a problem confirming the ssl certificate",
+                "ERROR: No matching distribution found for numpy==2.4.6",
+            ],
+            "cannot open encrypted connections",
         ),
         (["ERROR: No matching distribution found for numpy==2.4.6"], "no ready-made package numpy==2.4.6 for this"),
         (["ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device"], "disk is full"),

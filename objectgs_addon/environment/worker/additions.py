@@ -30,7 +30,7 @@ def add(options: argparse.Namespace, stop: Callable[[], bool]) -> None:
     progress = Progress({"packages": ("Installing", 60.0)})
     progress.begin("packages", "Resolving the packages")
     wanted = options.requirements / layout.MODELS
-    with tempfile.TemporaryDirectory(prefix="objectgs-") as name:
+    with tempfile.TemporaryDirectory(prefix="objectgs-", ignore_cleanup_errors=True) as name:
         temporary = Path(name)
         pip = Pip(Path(sys.executable), Path(sysconfig.get_path("purelib")), temporary, progress, stop)
         kept = temporary / "installed.txt"

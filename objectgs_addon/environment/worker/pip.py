@@ -173,6 +173,11 @@ def why_pip_failed(lines: list[str]) -> str:
     broken = any(words in failure for words in _BROKEN)
     if "No space left on device" in text or "not enough space on the disk" in text:
         return "The disk is full; make room and try again."
+    if "ssl module in Python is not available" in text:
+        return (
+            "This Python cannot open encrypted connections, as happens with Anaconda's on Windows; choose another, "
+            "such as one from python.org."
+        )
     if _DISTRUSTED.search(text if lacking else failure):
         return (
             "The certificate of Python's package index is not accepted, as happens where a virus scanner or a proxy "

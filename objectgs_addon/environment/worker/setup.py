@@ -127,8 +127,10 @@ def claimed(folder: Path) -> Iterator[None]:
     if not layout.is_ours(folder):
         raise Refused(f"{folder} is not empty and was not made by ObjectGS, so it is not used; move it away.")
     for old in folder.parent.glob(folder.name + layout.REMOVED + "*"):
-        if layout.is_ours(old):
-            layout.remove_own(old)
+        # Blender may be removing it just now.
+        with contextlib.suppress(OSError):
+            if layout.is_ours(old):
+                layout.remove_own(old)
     folder.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as opened:
         stamp = opened.enter_context((folder / layout.STAMP).open("a+", encoding="utf-8"))
