@@ -598,8 +598,12 @@ def test_networks_have_one_thread_on_macos(stage, threads):
         "import os, sys; from backend.sfm import worker; sys.platform = 'darwin'; "
         f"worker.STAGES[{stage!r}] = lambda: print(os.environ['OMP_NUM_THREADS']); worker.main('4', {stage!r})"
     )
-    ran = subprocess.run([sys.executable, "-c", program], cwd=stages._ROOT, capture_output=True, text=True)
-    assert ran.stdout == f"{threads}\n", ran.stderr
+    # The process ends with its input.
+    with subprocess.Popen(
+        [sys.executable, "-c", program], cwd=stages._ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.read() == f"{threads}\n"
 
 
 def test_masks_and_names_that_cannot_be_used_do_not_stop_the_search_for_points(write_capture, tmp_path):
