@@ -24,7 +24,17 @@ from objectgs.objectgs_addon.state.folder_state import folder_state
 
 import headless
 
-from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
+from .building import (
+    HUGE,
+    OBJECTS,
+    look_at,
+    splat_table,
+    tetrahedron,
+    write_cameras,
+    write_folder,
+    write_meshes,
+    write_png,
+)
 from .drawn import texts_of
 
 ORIGIN = np.array([1000.0, -2000.0, 30.0])
@@ -259,6 +269,43 @@ def test_unchanged_mesh_is_not_updated(root, folder):
     assert coordinates(obj) == pytest.approx(moved)
     bpy.data.objects.remove(obj)
     assert blender_scene.show_meshes(root, folder).updated == 1, "a deleted mesh is shown again"
+
+
+def later(path):
+    """Change the time of a file alone, as copying and synchronizing a project do."""
+    os.utime(path, ns=(path.stat().st_mtime_ns + 5_000_000_000,) * 2)
+
+
+def test_edited_geometry_stays_where_only_times_or_the_texture_change(root, folder):
+    obj = mesh_of(root, 1)
+    obj.data.vertices[0].co.x += 5
+    moved = coordinates(obj)
+    image = image_of(obj.data.materials[0])
+    for path in (folder / "meshes").iterdir():
+        later(path)
+    assert blender_scene.show_meshes(root, folder).updated == 0
+    write_png(folder / "meshes" / "1.png", (0, 255, 0))
+    later(folder / "meshes" / "1.png")
+    assert blender_scene.show_meshes(root, folder).updated == 1
+    assert tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
+    assert coordinates(obj) == pytest.approx(moved)
+    rewrite(folder)
+    assert blender_scene.show_meshes(root, folder).updated == 1
+    assert np.ptp(coordinates(obj), axis=0).max() < 4, "a new mesh replaces the geometry"
+
+
+def test_stamps_of_earlier_versions_are_known(root, folder):
+    """They are the times of both files."""
+    obj = mesh_of(root, 1)
+    obj.data.vertices[0].co.x += 5
+    moved = coordinates(obj)
+    files = [folder / "meshes" / name for name in ("1.ply", "1.png")]
+    obj["objectgs_written"] = " ".join(str(path.stat().st_mtime_ns) for path in files)
+    assert blender_scene.show_meshes(root, folder).updated == 0
+    for path in files:
+        later(path)
+    assert blender_scene.show_meshes(root, folder).updated == 0, "it has taken over the content"
+    assert coordinates(obj) == pytest.approx(moved)
 
 
 def test_meshes_are_parented_to_restored_pivots(root, folder):

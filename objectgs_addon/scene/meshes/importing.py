@@ -16,12 +16,12 @@ from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark,
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
 from ..object_display import Objects
 from ..shading.materials import mesh_material
-from .listed import ListedMesh
+from .listed import ListedMesh, stamp_of
 from .shading import shading_of
 from .textures import load_texture, reload_texture
 
 WRITTEN = "objectgs_written"
-"""Custom property of a mesh object: the modification times of the files it shows."""
+"""Custom property of a mesh object: the stamps of the mesh file and the texture that it shows, with a space between."""
 
 UV_MAP, COLORS = "UVMap", "Col"
 
@@ -55,16 +55,24 @@ class MeshImporter:
             obj: the Blender object that already shows the mesh, or None.
 
         Returns:
-            Whether its files were read.
+            Whether its geometry or its texture was updated.
 
         Raises:
             InputError: The mesh's file cannot be shown; nothing is changed.
         """
         collection = self.root if target is None else self.collections.get(target)
         in_place = obj is not None and collection is not None and _contains(collection, obj)
-        written = listed.written()
-        if obj is not None and in_place and obj.parent is not None and obj.get(WRITTEN) == written:
-            return False
+        before = "" if obj is None else str(obj.get(WRITTEN, ""))
+        known_mesh, _, known_texture = before.partition(" ")
+        mesh_stamp, same_mesh = stamp_of(listed.mesh, known_mesh)
+        texture_stamp, same_texture = stamp_of(listed.texture, known_texture)
+        written = f"{mesh_stamp} {texture_stamp}"
+        if obj is not None and in_place and obj.parent is not None and same_mesh:
+            if not same_texture:
+                self._update_texture(obj, listed)
+            if written != before:
+                obj[WRITTEN] = written
+            return not same_texture
         loaded = _read(listed)
         positions = loaded.vertices - self.origin
         if target is not None and collection is None:
@@ -86,10 +94,8 @@ class MeshImporter:
         if obj.parent is None or not in_place:
             obj.parent = pivot
         fill_mesh(obj.data, positions - center, loaded)
-        self._update_material(obj, listed)
+        self._update_texture(obj, listed)
         obj[WRITTEN] = written
-        if not listed.texture.is_file():
-            self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; extract the mesh again.")
         return True
 
     def unlink(self, obj: bpy.types.Object) -> None:
@@ -113,6 +119,11 @@ class MeshImporter:
         collection.objects.link(obj)
         self.changed.add(target)
         return obj
+
+    def _update_texture(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
+        if not listed.texture.is_file():
+            self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; extract the mesh again.")
+        self._update_material(obj, listed)
 
     def _update_material(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
         """Add the add-on's material to a mesh without materials; otherwise only reload the add-on's textures."""

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,10 +31,6 @@ class ListedMesh:
     mesh: Path
     texture: Path
     name: str
-
-    def written(self) -> str:
-        """Return the modification times of its files in ns as a string, since Blender's integers have 32 bits."""
-        return " ".join(_modified(path) for path in (self.mesh, self.texture))
 
 
 def read_listed(folder: Path) -> list[ListedMesh]:
@@ -103,8 +100,26 @@ def assign_to_collections(
     ], warnings
 
 
-def _modified(path: Path) -> str:
+def stamp_of(path: Path, known: str) -> tuple[str, bool]:
+    """Return a stamp of a file, and whether its content is still that of a known stamp.
+
+    Copying a project or saving the file again changes the time alone. A file of the known time is not read.
+
+    Args:
+        path: the file.
+        known: an earlier stamp; earlier versions stored the time alone. "" for a missing file.
+
+    Returns:
+        The time in ns, the size and the checksum as a string, or "" for a missing file; and whether nothing has
+        changed but the time.
+    """
     try:
-        return str(path.stat().st_mtime_ns)
+        modified = str(path.stat().st_mtime_ns)
+        known_time, _, known_content = known.partition(":")
+        if modified == known_time and known_content:
+            return known, True
+        data = path.read_bytes()
     except OSError:
-        return ""
+        return "", not known
+    content = f"{len(data)}:{zlib.crc32(data):08x}"
+    return f"{modified}:{content}", modified == known_time or content == known_content

@@ -51,8 +51,8 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     """Show the meshes listed in meshes.json, each aligned with its splats.
 
     Existing meshes are updated in place if their files changed: transforms, names, modifiers, materials and material
-    slots are kept. A mesh whose files have not changed is not modified. A mesh made from other objects than those its
-    collection shows is removed.
+    slots are kept. A mesh whose files have not changed is not modified, and one of which only the texture has changed
+    keeps its geometry. A mesh made from other objects than those its collection shows is removed.
 
     Args:
         root: the reconstruction's collection.
