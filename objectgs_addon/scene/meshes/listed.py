@@ -88,16 +88,25 @@ def assign_to_collections(
                 f"The mesh of {objects.name(mesh.object_id)} was made when other objects were merged with "
                 "it and is not shown; extract it again."
             )
-    of_target: dict[int, list[set[int]]] = {}
+    of_target: dict[int, list[ListedMesh]] = {}
     for mesh, target in assigned:
         if target is not None:
-            of_target.setdefault(target, []).append(set(mesh.ids or ()))
+            of_target.setdefault(target, []).append(mesh)
     # Skip meshes that are part of a mesh made later from the merged object.
     return [
         (mesh, target)
         for mesh, target in assigned
-        if target is None or not any(other > set(mesh.ids or ()) for other in of_target[target])
+        if target is None or not any(_replaces(other, mesh, target) for other in of_target[target])
     ], warnings
+
+
+def _replaces(other: ListedMesh, mesh: ListedMesh, target: int) -> bool:
+    """Return whether a mesh contains another one of its collection.
+
+    Of meshes of the same objects, which were merged in different directions, the object's own one is shown.
+    """
+    own, others = set(mesh.ids or ()), set(other.ids or ())
+    return others > own or (others == own and other.object_id == target != mesh.object_id)
 
 
 def stamp_of(path: Path, known: str) -> tuple[str, bool]:
