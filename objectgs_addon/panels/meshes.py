@@ -43,10 +43,12 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
                 "Extract Meshes continues it.",
                 "INFO",
             )
-        if state.stale_meshes and not background.is_busy(root):
+        # The mesh of the whole scene is only updated with its option, or where it is the only one.
+        stale = state.stale_meshes + (state.stale_scene and (properties.mesh_scene or not properties.objects))
+        if stale and not background.is_busy(root):
             write(
                 layout,
-                f"{state.stale_meshes} of {state.meshes} meshes were made at another step of the training. "
+                f"{stale} of {state.meshes} meshes were made at another step of the training. "
                 "Extract Meshes updates them.",
                 "INFO",
             )

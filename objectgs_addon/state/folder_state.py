@@ -10,7 +10,8 @@ from ...backend.shared.reconstruction.cameras import read_cameras
 from ...backend.shared.reconstruction.checkpoint import CURRENT, CheckpointHeader, read_header
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.meshes import NAME as MESHES
-from ...backend.shared.reconstruction.meshes import read_meshes, read_waiting
+from ...backend.shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting
+from ...backend.shared.reconstruction.objects import read_objects, shown_as
 from ...backend.shared.reconstruction.record import Record, read_record
 
 
@@ -31,7 +32,8 @@ class FolderState:
         outdated: the training is that of another capture than the present one, for example of other poses.
         agreement: how well the photos agree, in dB, or None.
         meshes: number of meshes.
-        stale_meshes: number of meshes made at another training step than the checkpoint's.
+        stale_meshes: number of meshes of shown objects made at another training step than the checkpoint's.
+        stale_scene: the mesh of the whole scene was made at another training step.
         waiting_meshes: number of meshes that a job is to make, or was when it was interrupted.
         quality, zero_is_background: of the checkpoint's header.
     """
@@ -50,6 +52,7 @@ class FolderState:
     outdated: bool = False
     agreement: float | None = None
     waiting_meshes: int = 0
+    stale_scene: bool = False
     quality: Mapping[str, float] = field(default_factory=dict)
     zero_is_background: bool = False
 
@@ -102,7 +105,8 @@ def folder_state(folder: Path) -> FolderState:
     if before is not None and before[0] == stamp:
         return before[1]
     header = read_header(paths.checkpoint) or CheckpointHeader(0, 0.0)
-    made = _mesh_steps(paths.meshes)
+    made = _meshes(paths.meshes)
+    stale = [entry for entry in made if entry.trained_steps != header.steps]
     capture, pixels = _views(paths.folder)
     record = _record(paths)
     state = FolderState(
@@ -115,11 +119,12 @@ def folder_state(folder: Path) -> FolderState:
         capture=capture,
         pixels=pixels,
         meshes=len(made),
-        stale_meshes=sum(at != header.steps for at in made),
+        stale_meshes=len({entry.object_id for entry in stale} & _meshed_objects(paths.objects)),
         unfinished=header.steps > 0 and _is_unfinished(record, header),
         outdated=header.steps > 0 and _is_outdated(record),
         agreement=None if record.capture is None else record.capture.agreement,
         waiting_meshes=len(read_waiting(paths.meshes)),
+        stale_scene=any(entry.ids is None for entry in stale),
         quality=header.quality,
         zero_is_background=header.zero_is_background,
     )
@@ -168,9 +173,19 @@ def _is_outdated(record: Record) -> bool:
     return capture.digest != training.votes.capture
 
 
-def _mesh_steps(folder: Path) -> list[int | None]:
-    """Return the training step at which each mesh was made."""
+def _meshes(folder: Path) -> list[MeshEntry]:
+    """Return the entries of the meshes that have a file."""
     try:
-        return [entry.trained_steps for entry in read_meshes(folder).values() if entry.file]
+        return [entry for entry in read_meshes(folder).values() if entry.file]
     except InputError:
         return []
+
+
+def _meshed_objects(path: Path) -> set[int | None]:
+    """Return the IDs of the objects that get a mesh of their own; those that are merged or left out get none."""
+    try:
+        objects = [entry for entry in read_objects(path) if entry.id]
+    except InputError:
+        return set()
+    separated = {entry.id for entry in objects if entry.separated}
+    return {i for i, target in shown_as(objects).items() if target == i and i not in separated}

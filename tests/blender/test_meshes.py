@@ -353,6 +353,15 @@ def test_merged_objects_keep_meshes_until_remeshed(root, folder):
     assert not parts(root, 1, "splats")[0].hide_render
 
 
+def test_merging_in_the_other_direction_shows_one_mesh(root, folder):
+    meshes = {"1": tetrahedron(ORIGIN), "2": tetrahedron(ORIGIN, 2.0)}
+    write_meshes(folder, meshes, ids={"1": [1, 2], "2": [1, 2]})
+    for kept, other in ((2, 1), (1, 2)):
+        edit_objects(folder / "objects.json", {other: dict(merged_into=kept), kept: dict(merged_into=None)})
+        blender_scene.show_objects(root, folder)
+        assert mesh_of(root, kept)["objectgs_mesh"] == str(kept)
+
+
 def test_split_objects_regain_meshes_and_materials(root, folder):
     can = mesh_of(root, 2)
     material = can.data.materials[0]
@@ -710,6 +719,22 @@ def test_folder_state_counts_outdated_meshes(folder):
     state = folder_state(folder)
     assert (state.meshes, state.stale_meshes) == (2, 2)
     assert folder_state(folder.parent).meshes == 0
+
+
+def test_only_meshes_that_would_be_made_again_are_outdated(active, folder):
+    assert "2 of 2 meshes were made at another step" in texts_of(panels.meshes.MeshesPanel)
+    write_meshes(
+        folder, {key: tetrahedron(ORIGIN) for key in ("1", "2", "scene", "both")}, ids={"scene": None, "both": [1, 2]}
+    )
+    edit_objects(folder / "objects.json", {2: dict(merged_into=1)})
+    assert "1 of 4 meshes were made at another step" in texts_of(panels.meshes.MeshesPanel)
+    active.objectgs.mesh_scene = True
+    assert "2 of 4 meshes were made at another step" in texts_of(panels.meshes.MeshesPanel)
+    active.objectgs.mesh_scene = False
+    edit_objects(folder / "objects.json", {1: dict(left_out=True)})
+    assert "made at another step" not in texts_of(panels.meshes.MeshesPanel)
+    active.objectgs.objects.clear()
+    assert "1 of 4 meshes were made at another step" in texts_of(panels.meshes.MeshesPanel)
 
 
 def test_mark_assets_sets_origin_at_base(active):
