@@ -774,6 +774,19 @@ def test_exported_meshes_have_edits(root, tmp_path, suffix):
     assert {path.name for path in (tmp_path / "each").glob(f"*.{suffix}")} == {f"mug.{suffix}", f"can.{suffix}"}
 
 
+@pytest.mark.parametrize("names", [("box 1", "box.1"), ("Mug", "mug")])
+def test_exported_textures_of_similar_names_are_kept_apart(root, tmp_path, names):
+    for object_id, name in zip((1, 2), names, strict=True):
+        image = part(root, "mesh", object_id).data.materials[0].node_tree.nodes["Image Texture"].image
+        image.name = name
+        image.pixels[:] = [float(object_id == 1), 0.0, 0.0, 1.0] * (len(image.pixels) // 4)
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format="obj") == {"FINISHED"}
+    textures = [path for path in tmp_path.iterdir() if path.suffix == ".png"]
+    assert len({path.name.casefold() for path in textures}) == 2
+    reds = {round(bpy.data.images.load(str(path)).pixels[0]) for path in textures}
+    assert reds == {0, 1}, "each object has its own texture"
+
+
 def test_rotation_by_right_angle(root):
     """A rotation about the center has a known result."""
     pivot = part(root, "object_parent")

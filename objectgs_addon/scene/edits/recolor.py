@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def with_own_textures(
     Args:
         material: the material to copy.
         recolor: the recoloring; None to keep the colors.
-        folder: where to save the images as PNG.
+        folder: where to save the images as PNG; those that are there are kept.
         prefix: how the names of these files begin.
 
     Returns:
@@ -107,13 +108,20 @@ def with_own_textures(
         image = bpy.data.images.new(source.name, *source.size)
         image.pixels.foreach_set(pixels)
         stem = bpy.path.clean_name(source.name if recolor is None else f"{source.name} recolored")
-        image.filepath_raw = str(folder / f"{prefix}{stem}.png")
+        image.filepath_raw = str(_free_path(folder, f"{prefix}{stem}"))
         image.file_format = "PNG"
         image.save()
         image.source = "FILE"
         node.image = image
         images.append(image)
     return copy, images
+
+
+def _free_path(folder: Path, stem: str) -> Path:
+    """Return a PNG in a folder whose name differs from those of the others in more than upper and lower case."""
+    taken = {path.stem.casefold() for path in folder.iterdir()}
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    return folder / f"{next(name for name in names if name.casefold() not in taken)}.png"
 
 
 def _is_ours(node: bpy.types.Node) -> bool:
