@@ -6,6 +6,7 @@ It writes events as JSON lines and reads one word per line. No call blocks.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -82,6 +83,9 @@ class BackendProcess:
         _ignore_broken_pipes()
         self._events: queue.Queue[dict[str, Any]] = queue.Queue(_WAITING_EVENTS)
         self._log: deque[str] = deque(maxlen=LOG_LINES)
+        self._lines: list[tuple[bytes, bool]] = []
+        self._lines_changed = threading.Condition()
+        self._input_ends = False
         self._ended_at: float | None = None
         # With a separate process group, Ctrl-C in Blender's terminal reaches only Blender. A separate session would
         # also do that, but Linux divides CPU time equally between sessions and would ignore the lower priority.
@@ -113,6 +117,7 @@ class BackendProcess:
         ]
         for reader in self._readers:
             reader.start()
+        threading.Thread(target=self._write, daemon=True).start()
         self.send("attached")
 
     def _lower_priority(self) -> None:
@@ -135,13 +140,41 @@ class BackendProcess:
         """The most recent lines from both pipes that are not events, oldest first."""
         return list(self._log)
 
-    def send(self, line: str) -> bool:
-        """Write a line to the child; return False if it no longer reads its input."""
-        try:
-            self._input.write(line.encode() + b"\n")
-        except (OSError, ValueError):
+    def send(self, line: str, replaces: bool = False) -> bool:
+        """Write a line to the child as soon as it can be written; return False if the child no longer reads its input.
+
+        replaces: drop earlier lines of this kind that the child has not taken yet.
+        """
+        if self._process.poll() is not None:
             return False
+        with self._lines_changed:
+            if self._input_ends:
+                return False
+            if replaces:
+                self._lines = [each for each in self._lines if not each[1]]
+            self._lines.append((line.encode() + b"\n", replaces))
+            self._lines_changed.notify()
         return True
+
+    def _write(self) -> None:
+        """Write the lines that are sent; in a thread of its own, since a child that computes may not read for long."""
+        try:
+            while True:
+                with self._lines_changed:
+                    self._lines_changed.wait_for(lambda: self._lines or self._input_ends)
+                    if self._input_ends:
+                        break
+                    line, _ = self._lines.pop(0)
+                self._input.write(line)
+        except (OSError, ValueError):
+            self._end_input()
+        with contextlib.suppress(OSError):
+            self._input.close()
+
+    def _end_input(self) -> None:
+        with self._lines_changed:
+            self._input_ends = True
+            self._lines_changed.notify()
 
     def stop(self) -> bool:
         """Request the child to save and end; return False if it no longer reads its input."""
@@ -149,6 +182,7 @@ class BackendProcess:
 
     def kill(self) -> None:
         """End the child and its children immediately; do nothing if the child has ended."""
+        self._end_input()
         if self._process.poll() is not None:
             return
         try:
@@ -190,7 +224,7 @@ class BackendProcess:
             return None
         if not self._events.empty():
             return None
-        self._input.close()
+        self._end_input()
         return code
 
     def _read(self, stream: Any) -> None:

@@ -70,7 +70,7 @@ class _Session:
             return
         self.asked += 1
         self._asked_strokes = content["strokes"]
-        self.process.send(json.dumps({"request": self.asked, **content}))
+        self.process.send(json.dumps({"request": self.asked, **content}), replaces=True)
 
     def propose(self, detail: float) -> None:
         """Ask for objects without strokes, now or as soon as the process is ready; detail: how finely to divide."""
@@ -78,7 +78,8 @@ class _Session:
         if self.ready:
             self.asked += 1
             self.is_proposing = True
-            self.process.send(json.dumps({"request": self.asked, "propose": True, "detail": detail}))
+            content = {"request": self.asked, "propose": True, "detail": detail}
+            self.process.send(json.dumps(content), replaces=True)
 
     def take(self, event: dict[str, Any]) -> int | None:
         """Process an event; return the number of a stroke that shows no splats."""

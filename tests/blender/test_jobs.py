@@ -370,6 +370,45 @@ def test_sending_to_ended_process_is_safe(tmp_path):
         signal.signal(signal.SIGPIPE, before)
 
 
+def test_sending_does_not_wait_for_a_busy_process(tmp_path):
+    """A request that waits is dropped for a newer one, and other lines are kept in order."""
+    script, go = tmp_path / "fake.py", tmp_path / "go"
+    script.write_text(
+        PRELUDE
+        + f"""
+while not os.path.exists({str(go)!r}):
+    time.sleep(0.01)
+for line in sys.stdin:
+    say("read", words=[line[:9].strip(), len(line)])
+    if line.startswith("last"):
+        break
+"""
+    )
+    process = BackendProcess([sys.executable, str(script)], tmp_path)
+    began = time.monotonic()
+    for number in range(50):
+        assert process.send(f"{number:02} " + 100_000 * "x", replaces=True)
+        assert process.send(f"other {number:02}")
+    assert process.send("last")
+    assert time.monotonic() - began < 5.0
+    go.touch()
+    words = []
+    until(lambda: process.exit_code == 0, lambda: words.extend(event["words"][0] for event in process.poll()))
+    requests = [word for word in words if word[0].isdigit()]
+    assert len(requests) < 5 and requests[-1] == "49 xxxxxx"
+    others = [f"other {number:02}" for number in range(50)]
+    assert [word for word in words if word not in requests] == ["attached", *others, "last"]
+
+
+def test_killed_process_leaves_no_thread(tmp_path):
+    before = threading.active_count()
+    process = BackendProcess([sys.executable, "-c", "import time; time.sleep(60)"], tmp_path)
+    process.send(1_000_000 * "x")
+    process.kill()
+    until(lambda: threading.active_count() == before)
+    assert process.send("stop") is False
+
+
 def test_failed_starts_are_reported(make, tmp_path):
     job = run(make("", command=[str(tmp_path / "no-python"), "-m", "backend"]))
     assert job.state is State.FAILED and "no-python could not be started" in job.error

@@ -299,7 +299,7 @@ class _Process:
         events, self.events = self.events, []
         return events
 
-    def send(self, line: str) -> bool:
+    def send(self, line: str, replaces: bool = False) -> bool:
         self.sent.append(json.loads(line))
         return True
 
