@@ -36,6 +36,8 @@ INTERVAL = 0.1
 DRAW_EVERY = 1.0
 """Minimum time in seconds between two redraws for new figures."""
 _SHOWN_WARNINGS = 3
+_MARKING_GOES_ON = ("export", "film", "fill", "plan")
+"""Kinds of jobs that need little memory, and change no splats, points or masks."""
 
 _REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "import": ("objectgs.import_capture", "Choose Another Folder...", {}),
@@ -72,7 +74,8 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
         The return value for the operator's `execute`.
     """
     _submitted_in[job] = owner.session_uid
-    pointing.release(job.folder, keeps_colors=job.kind == "label" and not bpy.app.background)
+    if job.kind not in _MARKING_GOES_ON:
+        _end_marking(job)
     if bpy.app.background:
         run_blocking(job, ConsoleReporter())
         if job.state is not State.DONE:
@@ -88,6 +91,14 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
     return {"FINISHED"}
+
+
+def _end_marking(job: Job) -> None:
+    """End the process that finds marked objects, and say so unless their separation needs its end."""
+    separates = job.kind == "label"
+    ended = pointing.release(job.folder, keeps_colors=separates and not bpy.app.background)
+    if ended and not separates:
+        messages.show(f"Marking has ended for {job.title}; the strokes are kept, and Mark Objects continues it.")
 
 
 def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
@@ -278,6 +289,7 @@ def finish(job: Job) -> None:
     show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
         _push_undo(job.title)
+    pointing.show()  # A filled hole adds splats to those that are marked.
     if job.kind == "packages":
         _go_on(job, owner)
     if job.kind in ("import", "masks") and owner is not None and not bpy.app.background:

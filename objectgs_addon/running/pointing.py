@@ -230,18 +230,19 @@ def propose(root: bpy.types.Collection) -> None:
     _session.propose(root.objectgs.detail)
 
 
-def release(folder: Path | None, keeps_colors: bool = False) -> None:
-    """End the process if it reads this folder, which a job is going to change.
+def release(folder: Path | None, keeps_colors: bool = False) -> bool:
+    """End the process if it reads this folder, which a job is going to change; return whether it did.
 
     keeps_colors: the marked splats are drawn in the colors of their objects until `separated`.
     """
     global _keeps_colors
     if _session is None or folder is None or _session.folder != folder:
-        return
+        return False
     if keeps_colors:
         _keeps_colors = _end()
     else:
         stop()
+    return True
 
 
 def is_active(root: bpy.types.Collection) -> bool:

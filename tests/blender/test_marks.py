@@ -356,6 +356,32 @@ def test_marks_stay_in_the_viewport_while_their_objects_are_separated(root, sess
     assert not are_colored()
 
 
+@pytest.mark.parametrize(("kind", "goes_on"), [("export", True), ("fill", True), ("train", False), ("vote", False)])
+def test_jobs_end_the_marking_only_if_they_change_what_is_marked(root, session, monkeypatch, kind, goes_on):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
+    app = SimpleNamespace(background=False, timers=SimpleNamespace(is_registered=lambda _function: True))
+    job = locations.backend_job("Job", kind, blender_scene.folder_of(root), kind)
+    with monkeypatch.context() as patched:
+        patched.setattr(background, "bpy", SimpleNamespace(app=app))
+        background.submit(job, bpy.context.scene, print)
+    background.queue.jobs.remove(job)
+    background._submitted_in.clear()
+    assert pointing.is_active(root) is goes_on
+    assert any("Marking has ended for Job" in text for text in told) is not goes_on
+
+
+def test_marks_are_shown_on_splats_that_a_job_has_changed(root, session, monkeypatch):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    item = marks.add_object(root)
+    marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1)], area=False)
+    answer(session, [item.object_id], [0] * len(session.keys))
+    shown = []
+    monkeypatch.setattr(drawing, "show_labels", lambda labels, _colors: shown.append(labels))
+    background.finish(locations.backend_job("Job", "fill", blender_scene.folder_of(root), "edit"))
+    assert shown
+
+
 def test_one_list_of_objects_is_open(root, session):
     """Once the objects are separated, the list of the marked ones has the same names, unless they are being marked."""
     marks.add_object(root)
