@@ -296,8 +296,8 @@ def _add_edit(commands: _Commands) -> None:
     )
     edit.add_argument(
         "--fill", action="store_true",
-        help="with --remove: fill the holes in flat ground or walls behind the objects from their surroundings; the "
-        "fill is marked as unobserved",
+        help="with --remove or --move: fill the holes that the objects leave in flat ground or walls from their "
+        "surroundings; the fill is marked as unobserved",
     )  # fmt: skip
     edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="restore removed objects")
     edit.add_argument(

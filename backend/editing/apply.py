@@ -58,12 +58,12 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
 
 @dataclass(frozen=True)
 class Fill:
-    """The filling of the holes of removed objects, untransformed and in the captured colors.
+    """The filling of the holes of removed and moved objects, untransformed and in the captured colors.
 
     Attributes:
         splats: n splats.
         put: (n,) bool; true for new splats, false for captured splats that they replace.
-        fills: (n,) IDs of the removed objects whose holes are filled.
+        fills: (n,) IDs of the objects whose holes are filled.
     """
 
     splats: Splats
@@ -72,7 +72,7 @@ class Fill:
 
 
 def compute_fill(splats: Splats, objects: Sequence[SceneObject], reporter: Reporter | None = None) -> Fill:
-    """Return the filling of the holes of removed objects, as `apply_edits` uses it.
+    """Return the filling of the holes of removed and moved objects, as `apply_edits` uses it.
 
     reporter: receives the progress.
     """
@@ -137,16 +137,20 @@ def _remove_and_fill(
     fills = np.zeros(len(edited), np.int64)
     taken: list[tuple[Splats, int]] = []
     reporter = reporter or Reporter()
-    filled = [entry for entry in objects if entry.removed and entry.fill]
+    filled = [entry for entry in objects if entry.fill]
     for done, entry in enumerate(filled):
 
         def report(fraction: float, done: int = done) -> None:
             reporter.progress(done + fraction, len(filled), what="holes")
 
-        gone, put = fill_hole(edited, splats.select(_with_id(splats, entry.id, objects)), report)
+        # A moved object is still where it was captured here.
+        others = edited.object_ids != entry.id
+        replaced, put = fill_hole(edited.select(others), splats.select(_with_id(splats, entry.id, objects)), report)
         report(1.0)
         if len(put) == 0:
             continue
+        gone = others.copy()
+        gone[others] = replaced
         taken.append((edited.select(gone & (fills == 0)), entry.id))
         edited = concatenate([edited.select(~gone), put])
         fills = np.append(fills[~gone], np.full(len(put), entry.id))

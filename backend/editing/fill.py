@@ -1,4 +1,4 @@
-"""Filling the hole that a removed object leaves in the ground or a wall, with copies of the surroundings.
+"""Filling the hole that a removed or moved object leaves in the ground or a wall, with copies of the surroundings.
 
 The object stands on or against planes; the splats of its neighbors are in these planes or, as in rumpled cloth, near
 them. No photo shows the part of such a plane that the object hid. That part is filled with a patch of the visible part

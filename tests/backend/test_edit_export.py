@@ -109,6 +109,10 @@ def test_fills_are_cached_per_edit_state(run_command, folder):
     assert path() != first and path().is_file()
     run_command("edit", folder.folder, "--restore", "can")
     assert path() == first and first.stat().st_mtime_ns == written
+    run_command("edit", folder.folder, "--restore", "mug")
+    moved = run_command("edit", folder.folder, "--move", "mug:x=1", "--fill").out
+    assert path() != first and f"1 mug: its hole filled with {count} new splats, moved" in moved
+    run_command("edit", folder.folder, "--remove", "mug", "--fill")
     for i in range(12):
         (folder.cache / f"fill-{i}.ply").touch()
     write_splats(folder.splats, splats.select(np.arange(len(splats)) > 0))
@@ -176,7 +180,7 @@ def test_edit_of_merged_object_applies_to_target(run_command, folder):
         (["--move", "can:scale=0"], ["scale=0"]),
         (["--move", "can:x=nan"], ["x=nan"]),
         (["--floaters"], ["--remove"]),
-        (["--restore", "mug", "--fill"], ["--remove"]),
+        (["--restore", "mug", "--fill"], ["--remove or --move"]),
     ],
 )
 def test_invalid_edits_are_rejected_without_writing(run_command, folder, words, expected):

@@ -334,7 +334,18 @@ def test_no_fill_without_surrounding_surface():
     for without in (splats.select(splats.object_ids != 5), splats.select(splats.means[:, 0] < 0.1)):
         edited = apply_edits(without, [scene_object(1, removed=True, fill=True)])
         assert same(edited, without.select(without.object_ids != 1))
-    assert not apply_edits(splats, [scene_object(1, fill=True)]).unobserved.any()
+    assert not apply_edits(splats, [scene_object(1, removed=True)]).unobserved.any()
+
+
+def test_hole_of_moved_object_is_filled():
+    """The fill is that of the removed object, and the object keeps all of its splats."""
+    splats, _ = with_box_on_ground()
+    removed = apply_edits(splats, [scene_object(1, removed=True, fill=True)])
+    away = affine(np.eye(3), (0.5, -0.5, 0))
+    edited = apply_edits(splats, [scene_object(1, transform=rows(away), fill=True)])
+    assert removed.unobserved.any() and same(edited.select(edited.object_ids != 1), removed)
+    own = splats.select(splats.object_ids == 1)
+    assert same(edited.select(edited.object_ids == 1), transformed(own, away))
 
 
 def test_empty_splats_can_be_edited():

@@ -27,11 +27,12 @@ _NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "cleaned",
 
 
 def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
-    """Store the edits of the options, fill the holes of removed objects, and report all edits."""
+    """Store the edits of the options, fill the holes of removed and moved objects, and report all edits."""
     folder = Reconstruction(options.folder)
-    for name in ("floaters", "fill"):
-        if getattr(options, name) and not options.remove:
-            raise InputError(f"--{name} requires --remove, which selects the objects to remove.")
+    if options.floaters and not options.remove:
+        raise InputError("--floaters requires --remove, which selects the objects to remove.")
+    if options.fill and not (options.remove or options.move):
+        raise InputError("--fill requires --remove or --move, which selects the objects that leave holes.")
     reporter.expect({READ: ("Reading", 3.0), FILL: ("Filling", 20.0)})
     reporter.begin(READ, "Reading the objects")
     edited = 0
@@ -75,6 +76,8 @@ def _changes(options: argparse.Namespace, wanted: _Edits) -> dict[int, dict[str,
     for word, values in options.move:
         (entry,) = wanted.find([word])
         wanted.change(entry, transform=wanted.transform(entry, Placement(**values)))
+        if options.fill:
+            wanted.change(entry, fill=True)
     for word, values in options.duplicate:
         (entry,) = wanted.find([word])
         wanted.change(entry, copies=[*wanted.copies(entry), wanted.transform(entry, Placement(**values))])
@@ -123,10 +126,10 @@ def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
     words += ["left out"] if entry.left_out else []
     if entry.removed:
         words.append("removed" + " with floaters" * entry.floaters)
-        if entry.fill and new_splats == 0:
-            words.append("its hole not filled, since there is no flat surface around it")
-        elif entry.fill:
-            words.append("its hole filled" + f" with {new_splats:,} new splats" * bool(new_splats))
+    if entry.fill and new_splats == 0:
+        words.append("its hole not filled, since there is no flat surface around it")
+    elif entry.fill:
+        words.append("its hole filled" + f" with {new_splats:,} new splats" * bool(new_splats))
     words += ["floaters hidden"] if entry.cleaned else []
     if entry.recolor:
         stored = entry.recolor.stored() or {}

@@ -52,7 +52,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "left-out objects are skipped."
         )
     if splats.unobserved.any():
-        reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed objects")
+        reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed and moved objects")
     if options.sh_degree is not None:
         splats = splats.with_degree(options.sh_degree)
     if options.bake_background and background:

@@ -1,4 +1,4 @@
-"""Filling of the holes of removed objects for Blender, computed once for each state of the edits."""
+"""Filling of the holes of removed and moved objects for Blender, computed once for each state of the edits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FILL = "fill"
 
 
 def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, int]:
-    """Fill the holes of removed objects where their edits ask for it, in the file that `fill_path` names.
+    """Fill the holes of removed and moved objects where their edits ask for it, in the file that `fill_path` names.
 
     Returns:
         The number of new splats for each object whose hole is to be filled.
@@ -23,7 +23,7 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
         return {}  # Edits may exist before splats.
     objects = read_objects(folder.objects)
     while (path := fill_path(folder, objects)) is not None and not path.is_file():
-        reporter.begin(FILL, "Filling the holes of removed objects")
+        reporter.begin(FILL, "Filling the holes of removed and moved objects")
         path.parent.mkdir(parents=True, exist_ok=True)
         splats = apply_splat_edits(read_splats(folder.splats)[0], folder)[0]
         if fill_path(folder, objects) != path:
@@ -33,4 +33,4 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     if path is None:
         return {}
     rows = read_fill(path)
-    return {entry.id: rows.count_new(entry.id) for entry in objects if entry.removed and entry.fill}
+    return {entry.id: rows.count_new(entry.id) for entry in objects if entry.fill}

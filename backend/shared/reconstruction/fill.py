@@ -1,7 +1,7 @@
-"""Fills of the holes that removed objects leave: PLY files in the reconstruction's cache, from `edit` for Blender.
+"""Fills of the holes that removed and moved objects leave: PLY files in the reconstruction's cache, from `edit` for Blender.
 
 Each row is a splat with the properties of splats.ply and two more: `unobserved` as uchar (1: a new splat, 0: a splat of
-splats.ply that new ones replace) and `fills` as uint32, the ID of the removed object whose hole it fills. Positions and
+splats.ply that new ones replace) and `fills` as uint32, the ID of the object whose hole it fills. Positions and
 colors are as captured, and object IDs are those of the continued surface. The file name is a hash of the splats and the
 edits, so undoing an edit finds the previous file again.
 """
@@ -40,7 +40,7 @@ class FillRows:
     Attributes:
         splats: (n,) rows with the properties of splats.ply.
         new: (n,) bool; true for unobserved splats, false for splats of splats.ply that these replace.
-        fills: (n,) int64 IDs of the removed objects whose holes are filled.
+        fills: (n,) int64 IDs of the objects whose holes are filled.
     """
 
     splats: np.ndarray
@@ -91,13 +91,13 @@ def fill_path(folder: Reconstruction, objects: Sequence[SceneObject]) -> Path | 
     Raises:
         InputError: splats.ply or splat-edits.ply cannot be read.
     """
-    if not any(entry.removed and entry.fill for entry in objects) or not folder.splats.is_file():
+    if not any(entry.fill for entry in objects) or not folder.splats.is_file():
         return None
     edits = [
         (entry.id, entry.merged_into, entry.left_out, entry.removed, entry.floaters, entry.fill)
         + ("cleaned",) * entry.cleaned
         for entry in objects
-        if entry.merged_into is not None or entry.left_out or entry.removed or entry.cleaned
+        if entry.merged_into is not None or entry.left_out or entry.removed or entry.fill or entry.cleaned
     ]
     made_of = f"{_FORMAT} {_digest(folder.splats)} {edits}"
     if folder.splat_edits.is_file():

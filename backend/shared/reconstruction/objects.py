@@ -57,7 +57,7 @@ class SceneObject:
         left_out: exclude it from the reconstruction.
         removed: hide the reconstructed object and its duplicates.
         floaters: if removed, also hide unlabeled splats inside its convex hull.
-        fill: if removed, fill the hole that it leaves in the ground or wall.
+        fill: fill the hole that it leaves in the ground or wall where it was captured, as it is removed or moved.
         cleaned: hide its floaters, as `shared/splats/floaters.py` finds them.
         recolor: color change of its splats and textures, or None.
         transform: affine map that moves it from its captured place, or None.
