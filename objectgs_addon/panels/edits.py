@@ -11,6 +11,8 @@ import numpy as np
 from mathutils import Matrix
 
 from .. import scene
+from ..picking import selection
+from ..process.jobs import State
 from ..running import background
 from ..running.job_display import write
 from ..state import object_list
@@ -29,15 +31,13 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             write(layout, "There are no objects yet.", "INFO")
             return
         collection = scene.object_collections(root).get(scene.from_stored(item.object_id))
-        row = layout.row()
-        row.label(text=item.name, icon="TRASH" if item.removed else "OUTLINER_COLLECTION")
+        several = [] if item.removed else selection.selected_collections(context, root)[1:]
+        heading = f"{len(several) + 1} selected objects" if several else item.name
+        layout.label(text=heading, icon="TRASH" if item.removed else "OUTLINER_COLLECTION")
         if item.removed:
             row = layout.row(align=True)
             row.operator("objectgs.restore_object", icon="LOOP_BACK")
-            fill = row.operator("objectgs.fill_hole", icon="MOD_REMESH", depress=item.fill)
-            fill.filled = not item.fill
-            if item.fill:
-                self._draw_fill(layout, root, collection)
+            self._draw_fill(layout, row, root, item, collection)
         else:
             column = layout.column(align=True)
             for text, floaters, fill in (
@@ -57,21 +57,38 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         if collection is None:
             write(layout, "This object has no splats and no mesh yet; train first.", "INFO")
             return
+        if several:
+            layout.label(text=item.name, icon="OUTLINER_COLLECTION")
         self._draw_colors(layout, item)
         copies = scene.duplicates_of(root).get(scene.from_stored(item.object_id), [])
         active = context.active_object
         self._draw_transform(layout, root, collection, copies, active if active in context.selected_objects else None)
+        if not item.removed and (item.fill or scene.is_moved(root, collection)):
+            self._draw_fill(layout, layout.row(), root, item, collection)
 
     def _draw_fill(
-        self, layout: bpy.types.UILayout, root: bpy.types.Collection, collection: bpy.types.Collection | None
+        self,
+        layout: bpy.types.UILayout,
+        row: bpy.types.UILayout,
+        root: bpy.types.Collection,
+        item: Any,
+        collection: bpy.types.Collection | None,
     ) -> None:
+        """Draw in a row whether the hole that an object leaves is filled, and below it with what."""
+        fill = row.operator("objectgs.fill_hole", icon="MOD_REMESH", depress=item.fill)
+        fill.filled = not item.fill
+        if not item.fill:
+            return
         count = None if collection is None else collection.get(scene.UNOBSERVED_COUNT)
-        job = background.job_of(root)
+        job = background.fill_of(root)
+        running = background.queue.running
         if count:
             write(layout, f"{count:,} splats fill the hole", "CHECKMARK")
         elif count == 0:
             write(layout, "No flat surface was found around the hole to fill it", "INFO")
-        elif job is not None and job.kind == "fill":
+        elif job is not None and job.state is State.WAITING and running is not None:
+            write(layout, f"The hole is filled when {running.title} has ended; stop it to fill it now.", "TIME")
+        elif job is not None:
             draw_job_of(layout, job)
 
     def _draw_colors(self, layout: bpy.types.UILayout, item: Any) -> None:
@@ -98,7 +115,7 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         chosen = next((copy for copy in copies if active is not None and active in set(copy.objects)), collection)
         place = scene.placement_of(root, chosen)
         column = layout.column(align=True)
-        moved = place is not None and not _is_identity(place)
+        moved = scene.is_moved(root, chosen)
         where = _describe_transform(root, chosen, place) if place is not None and moved else "Not moved"
         column.label(text=where if chosen == collection else f"Duplicate: {where.lower()}", icon="OBJECT_ORIGIN")
         if copies:
@@ -106,10 +123,6 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         row = column.row()
         row.enabled = moved and chosen == collection
         row.operator("objectgs.reset_object", text="Reset Transform", icon="LOOP_BACK").what = "TRANSFORM"
-
-
-def _is_identity(place: np.ndarray) -> bool:
-    return all(value == (i == j) for i, row in enumerate(place.tolist()) for j, value in enumerate(row))
 
 
 def _describe_transform(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray) -> str:

@@ -112,7 +112,8 @@ def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
         return
     folder = scene.folder_of(root)
     missing = scene.missing_fill(root, scene.Objects.read(folder))
-    is_asked = any(job.kind == "fill" and job.folder == folder and not job.is_finished for job in queue.jobs)
+    job = fill_of(root)
+    is_asked = job is not None and not job.is_finished
     owner = next(iter(object_list.scenes_of(root)), None)
     if missing is None or is_asked or owner is None or (not again and _requested_fills.get(folder) == missing):
         return
@@ -148,6 +149,13 @@ def install_transformers(owner: bpy.types.Scene, report: Callable[[set[str], str
 def job_of(root: bpy.types.Collection) -> Job | None:
     """Return the latest job in the queue for a reconstruction's folder, or None; other folders are not looked at."""
     return queue.of_folder(scene.folder_of(root)) if folder_trust.is_accepted(root) else None
+
+
+def fill_of(root: bpy.types.Collection) -> Job | None:
+    """Return the latest job in the queue that fills holes of a reconstruction, or None."""
+    folder = scene.folder_of(root)
+    jobs = (job for job in reversed(queue.jobs) if job.kind == "fill" and job.folder == folder)
+    return next(jobs, None) if folder_trust.is_accepted(root) else None
 
 
 def is_busy(root: bpy.types.Collection) -> bool:

@@ -228,7 +228,7 @@ def remove(root: bpy.types.Collection, object_ids: Iterable[int], floaters: bool
         floaters: also hide the unlabeled splats inside the objects.
         fill: fill the holes in the ground or walls behind the objects.
     """
-    change = {"removed": True, "floaters": floaters or None, "fill": fill or None}
+    change = {"removed": True, "floaters": floaters or None} | ({"fill": True} if fill else {})
     _show_edit(root, dict.fromkeys(object_ids, change))
 
 
@@ -238,7 +238,7 @@ def restore(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
 
 
 def fill_hole(root: bpy.types.Collection, object_id: int, is_filled: bool) -> None:
-    """Fill the hole behind a removed object, or remove the fill."""
+    """Fill the hole where a removed or moved object was captured, or remove the fill."""
     _show_edit(root, {object_id: {"fill": is_filled or None}})
 
 
@@ -441,10 +441,10 @@ def _restore(item: Any) -> None:
 
 
 def active_changed(properties: Any, context: bpy.types.Context) -> None:
-    """Select the clicked object of the list in the viewport."""
+    """Select the clicked object of the list in the viewport, or nothing if it is hidden, so that edits act on it."""
     if _filling or context.mode != "OBJECT":
         return  # Another active object would leave that in Edit Mode behind.
-    root = properties.id_data
-    item = object_list.active_item(root)
-    if item is not None:
-        selection.select_object(context, root, object_list.merge_target(root, from_stored(item.object_id)))
+    root, item = properties.id_data, object_list.active_item(properties.id_data)
+    target = None if item is None else object_list.merge_target(root, from_stored(item.object_id))
+    if target is not None and not selection.select_object(context, root, target):
+        selection.select_nothing(context)

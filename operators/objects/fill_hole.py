@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fill the hole behind a removed object, or leave it as it was trained."""
+"""Fill the hole that a removed or moved object leaves, or leave it as it was trained."""
 
 import bpy
 from bpy.props import BoolProperty
@@ -15,7 +15,7 @@ class FillHole(bpy.types.Operator):
     bl_idname = "objectgs.fill_hole"
     bl_label = "Fill Hole"
     bl_description = (
-        "Fill the hole in the ground or wall behind the removed object from its surroundings. The attribute "
+        "Fill the hole that the removed or moved object leaves in the ground or wall from its surroundings. The attribute "
         f'"{UNOBSERVED}" marks these splats'
     )
     bl_options = {"REGISTER", "UNDO"}
@@ -24,16 +24,18 @@ class FillHole(bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return cls.bl_description if properties.filled else "Leave what is behind the object as it was trained"
+        return cls.bl_description if properties.filled else "Leave the hole as it was trained"
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         if not need.edited(cls, context):
             return False
-        item = object_list.shown_item(need.active_root(context))
-        if item.removed:
+        root = need.active_root(context)
+        item = object_list.shown_item(root)
+        collection = scene.object_collections(root).get(scene.from_stored(item.object_id))
+        if item.removed or item.fill or (collection is not None and scene.is_moved(root, collection)):
             return True
-        cls.poll_message_set(f"{item.name} is not removed, so it leaves no hole")
+        cls.poll_message_set(f"{item.name} is neither removed nor moved, so it leaves no hole")
         return False
 
     @reports_errors

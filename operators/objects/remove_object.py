@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Remove objects until they are restored; duplicates are deleted."""
+"""Remove objects with their duplicates until they are restored; selected duplicates are deleted."""
 
 import bpy
 from bpy.props import BoolProperty
@@ -17,7 +17,8 @@ class RemoveObject(bpy.types.Operator):
     bl_label = "Remove"
     bl_description = (
         "Remove the objects selected in the viewport, or the active one of the list, from "
-        "viewports, renders and exports. Restore brings them back unchanged. Duplicates are deleted"
+        "viewports, renders and exports, with all of their duplicates. Restore brings them back unchanged. Selected "
+        "duplicates are deleted"
     )
     bl_options = {"REGISTER", "UNDO"}
 

@@ -38,12 +38,15 @@ class ResetObject(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
-        object_id = scene.from_stored(object_list.shown_item(root).object_id)
+        item = object_list.shown_item(root)
+        object_id = scene.from_stored(item.object_id)
         if self.what == "COLORS":
             object_edits.reset_colors(root, [object_id])
         else:
             scene.reset_placement(root, scene.object_collections(root)[object_id])
             object_edits.store_edits(root)
+            if item.fill and not item.removed:
+                object_edits.fill_hole(root, object_id, False)
 
 
 CLASSES = (ResetObject,)

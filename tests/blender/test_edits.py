@@ -23,7 +23,10 @@ from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import older_files
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
+from objectgs.objectgs_addon.panels.edits import EditPanel
 from objectgs.objectgs_addon.picking import selection
+from objectgs.objectgs_addon.process.jobs import Job, State
+from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import capture, carrier, kinds
 from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
@@ -34,6 +37,7 @@ from objectgs.objectgs_addon.state import object_edits, object_list, visibility
 import headless
 
 from .building import HUGE, OBJECTS, look_at, splat_table, tetrahedron, write_cameras, write_folder, write_meshes
+from .drawn import texts_of
 
 ORIGIN = np.array([100.0, -200.0, 30.0])
 RECOLOR = Recolor(
@@ -818,6 +822,9 @@ for ids in ([1], [1, int(sys.argv[2])]):
     kept = apply_edits(splats, read_objects(folder.objects))
     shown.append(kept.means[kept.object_ids == 2].astype(float).tolist())
     edit_objects(folder.objects, {i: {"removed": None, "fill": None} for i in ids})
+edit_objects(folder.objects, {1: {"fill": True}})
+fill_holes(folder, StoppingReporter(Reporter(), StopRequest()))
+edit_objects(folder.objects, {1: {"fill": None}})
 print(json.dumps(shown))
 """
 
@@ -825,7 +832,7 @@ print(json.dumps(shown))
 @pytest.fixture(scope="module")
 def filled_ground(made, tmp_path_factory, backend_python) -> tuple[Path, list[np.ndarray]]:
     """A folder with a flat ground (object 2) around a box (object 1), and another box, with cached fills for removal of
-    the first box and of both; and the positions of the ground's splats in both cases."""
+    the first box and of both, and for a move of the first; and the positions of the ground's splats after removals."""
     folder = Path(shutil.copytree(made, tmp_path_factory.mktemp("filled") / "table top"))
     rng = np.random.default_rng(0)
     flat = np.column_stack([rng.uniform(-1, 1, (4000, 2)), np.zeros(4000)])
@@ -893,6 +900,58 @@ def test_hole_is_filled_and_reopened(ground, filled_ground, root):
     assert surface(root) == one
     bpy.ops.objectgs.restore_object(object="1")
     assert surface(root) == captured and blender_scene.UNOBSERVED_COUNT not in collection_of(root)
+
+
+def test_hole_of_moved_object_is_filled(ground, root):
+    """The fill is that of the removed object, and is taken back as the object returns."""
+    blender_scene.show_kinds(root, "splats")
+    captured = surface(root)
+    activate(root, 1)
+    assert not bpy.ops.objectgs.fill_hole.poll() and "fill_hole" not in texts_of(EditPanel)
+    part(root, "object_parent").location.x += 0.5
+    assert "objectgs.fill_hole" in texts_of(EditPanel)
+    bpy.ops.objectgs.fill_hole()
+    filled = surface(root)
+    assert filled != captured and entry(root).fill and not blender_scene.is_removed(collection_of(root))
+    assert "splats fill the hole" in texts_of(EditPanel)
+    bpy.ops.objectgs.remove_object()
+    assert surface(root) == filled, "the hole stays filled"
+    bpy.ops.objectgs.restore_object(object="1")
+    assert surface(root) == captured
+    bpy.ops.objectgs.fill_hole()
+    assert surface(root) == filled
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert surface(root) == captured and not entry(root).fill
+
+
+def test_waiting_fill_says_for_what(ground, root, monkeypatch):
+    """A training that runs keeps the hole open until it ends or is stopped."""
+    jobs = [Job(title, kind, ground, [], ground) for title, kind in (("Train table", "train"), ("Fill", "fill"))]
+    jobs[0].state = State.PAUSED
+    activate(root, 1)
+    object_edits.remove(root, [1], False, True)
+    del collection_of(root)[blender_scene.UNOBSERVED_COUNT]
+    with monkeypatch.context() as changed:
+        changed.setattr(background.queue, "jobs", jobs)
+        assert "The hole is filled when Train table has ended; stop it to fill it now." in texts_of(EditPanel)
+
+
+def test_edits_act_on_what_the_panel_names(root):
+    """A hidden object cannot be selected, so that its row leaves nothing selected that edits would act on."""
+    activate(root, 2)
+    assert selection.selected_ids(bpy.context, root) == [2]
+    for obj in collection_of(root, 1).objects:
+        obj.hide_set(True)
+    activate(root, 1)
+    assert selection.selected_ids(bpy.context, root) == []
+    bpy.ops.objectgs.remove_object()
+    assert entry(root, 1).removed and not entry(root, 2).removed
+    selection.select_object(bpy.context, root, 2)
+    selection.select_object(bpy.context, root, HUGE, extend=True)
+    activate(root, HUGE)
+    assert texts_of(EditPanel).startswith(item(root, HUGE).name)
+    selection.select_object(bpy.context, root, 2, extend=True)
+    assert texts_of(EditPanel).startswith("2 selected objects")
 
 
 @pytest.mark.long

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Fills of holes left by removed objects.
+"""Fills of holes left by removed and moved objects.
 
 The backend computes unobserved splats, appended to the carriers whose surface they continue, and the splats that they
-replace, which are hidden. Both store the ID of the removed object.
+replace, which are hidden. Both store the ID of the object.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .single_splats import deleted_splats
 SHOWN_FILL = "objectgs_fill"
 """Custom property of a carrier's mesh: the name of the fill file that it shows."""
 UNOBSERVED_COUNT = "objectgs_unobserved"
-"""Custom property of a removed object's collection: the number of splats that fill its hole, if known."""
+"""Custom property of an object's collection: the number of splats that fill its hole, if known."""
 REPLACED = "objectgs_replaced"
 """Custom property of a carrier: a mesh is shown in its place. Only its splats that fill holes are shown then."""
 
@@ -40,7 +40,7 @@ def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
 
 
 def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
-    """Show the fills of removed objects that the edits require.
+    """Show the fills that the edits require.
 
     While the file for these edits is missing, objects that still require a fill keep the splats shown so far, also if
     the carriers have been filled anew.
@@ -50,7 +50,7 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
     """
     path = _path(root, objects)
     rows = read_fill(path) if path is not None and path.is_file() else None
-    filled = [entry.id for entry in objects.entries.values() if entry.removed and entry.fill]
+    filled = [entry.id for entry in objects.entries.values() if entry.fill]
     changes = []
     for object_id, collection in object_collections(root).items():
         obj = part_of(collection, SPLATS)
@@ -127,7 +127,7 @@ def _in_place_of(root: bpy.types.Collection, carriers: list[bpy.types.Object]) -
 
 
 def filled_objects(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Return the (n,) int64 IDs of the removed objects whose fill adds or replaces each splat of a carrier; else 0."""
+    """Return the (n,) int64 IDs of the objects whose fill adds or replaces each splat of a carrier; else 0."""
     if FILLS not in mesh.attributes:
         return np.zeros(len(mesh.vertices), np.int64)
     return carrier.read_ids(mesh, FILLS)

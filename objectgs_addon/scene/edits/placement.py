@@ -42,6 +42,12 @@ def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -
     return about(moved, origin_of(root))
 
 
+def is_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> bool:
+    """Return whether an object is not where it was captured."""
+    place = placement_of(root, collection)
+    return place is not None and not np.array_equal(place, np.eye(4))
+
+
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:
     """Move an object's pivot so that `placement_of` returns `place`; None restores the captured pose."""
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
