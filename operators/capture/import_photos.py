@@ -77,7 +77,8 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         self.layout.prop(self, "features")
         self.layout.prop(self, "frames")
         names = self._names()
-        self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else "All in the folder")
+        every = "All in the folder and its subfolders"
+        self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else every)
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
@@ -101,8 +102,12 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         return sorted(folder / name for name in self._names()) or [folder]
 
     def _names(self) -> list[str]:
-        """Return the names of the selected photos and videos; the file browser adds that of the open .blend."""
-        return [file.name for file in self.files if Path(file.name).suffix.lower() in PHOTOS | VIDEOS]
+        """Return the names of the selected photos and videos; the file browser adds that of the open .blend.
+
+        A single photo has no pose: a click on it, as on a file to be opened, is meant for all of the folder.
+        """
+        names = [file.name for file in self.files if Path(file.name).suffix.lower() in PHOTOS | VIDEOS]
+        return [] if len(names) == 1 and Path(names[0]).suffix.lower() in PHOTOS else names
 
 
 CLASSES = (ImportPhotos,)

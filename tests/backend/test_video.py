@@ -323,6 +323,18 @@ def test_photos_of_another_format_than_their_name_says_are_converted(tmp_path):
         photo_files.copy_photo(tmp_path / "d.heic", tmp_path / "images" / "d.heic", False)
 
 
+def test_number_of_photos_is_told(tmp_path):
+    """Photos of subfolders are found, too, which the user may not expect."""
+    for name in ("a.jpg", "day 2/b.jpg"):
+        (tmp_path / "trip" / name).parent.mkdir(parents=True, exist_ok=True)
+        heic(tmp_path / "trip" / name)
+    told = []
+    status = Reporter()
+    status.status = lambda message, **_: told.append(message)
+    photos.take_photos([tmp_path / "trip"], tmp_path / "capture", None, StoppingReporter(status, StopRequest()))
+    assert told == [f"Reading 2 photos of {tmp_path / 'trip'}"]
+
+
 def test_photos_that_changed_are_copied_again(tmp_path):
     """Their features are forgotten with those of all others."""
     folder, capture = tmp_path / "trip", tmp_path / "capture"

@@ -37,6 +37,7 @@ def submitted(fresh, tmp_path, monkeypatch):
         ([], [""], "trip"),
         ([""], [""], "trip"),
         (["scene.blend"], [""], "trip"),
+        (["b.jpg"], [""], "trip"),
         (["b.jpg", "a.heic"], ["a.heic", "b.jpg"], "trip"),
         (["walk.mov"], ["walk.mov"], "walk"),
     ],

@@ -111,6 +111,8 @@ def take_photos(
     if not in_place:
         copies = ((path, capture / IMAGES / _readable(path.relative_to(base))) for path in files)
         _require_space([path for path, copy in copies if not _is_copied(copy)], capture)
+    if len(files) > 1:
+        reporter.status(f"Reading {len(files)} photos of {base}")
     has_masks = are_beside or (source / MASKS).is_dir()
     if has_masks:
         masks_there = Files(base if are_beside else source / MASKS)
