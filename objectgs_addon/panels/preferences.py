@@ -98,7 +98,7 @@ def _draw_state(layout: bpy.types.UILayout) -> None:
     """Draw the state of the backend and of its set-up."""
     job = background.queue.of_folder(locations.environment_folder())
     if job is not None and not job.is_finished:
-        job_display.draw_running(layout, job, background.queue.jobs.index(job))
+        job_display.draw_running(layout, job, background.queue.jobs.index(job), background.queue.running)
         return
     sentence, icon = backend_state()
     job_display.write(layout, sentence, icon)

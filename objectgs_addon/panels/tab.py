@@ -59,4 +59,4 @@ def draw_job(layout: bpy.types.UILayout, job: Job, index: int, brief: bool = Fal
     if job.is_finished:
         draw_over(box, job)
     else:
-        draw_running(box, job, index, brief)
+        draw_running(box, job, index, background.queue.running, brief)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import bpy
 
@@ -18,6 +18,11 @@ CHARACTER = 6.6
 AROUND = 60.0
 """Width of borders and icon in pixels at a UI scale of 1."""
 
+_BUTTON = 45.0
+"""Width in pixels of a button beside a text at a UI scale of 1."""
+_WARNINGS = 2
+"""Number of warnings of a running job that are drawn, the latest ones."""
+
 _AFTER_STOP = {
     "train": " Resume continues it.",
     "mesh": " Extract Meshes continues it.",
@@ -27,8 +32,10 @@ _AFTER_STOP = {
 """Kind of a stopped job -> what to do next; others start anew."""
 
 
-def summary(job: Job) -> str:
-    """Return the state of a job in a few words."""
+def summary(job: Job, running: Job | None = None) -> str:
+    """Return the state of a job in a few words; `running`: the job that it waits for."""
+    if job.state is State.WAITING and running is not None:
+        return f"{job.title}: waiting for {running.title}" + " (paused)" * (running.state is State.PAUSED)
     if job.state is State.WAITING:
         return f"{job.title}: waiting"
     if job.state is State.PAUSED:
@@ -39,11 +46,21 @@ def summary(job: Job) -> str:
     return f"{job.title}: {job.stage or job.message}, {100 * job.progress:.0f} %{left}"
 
 
-def draw_running(layout: bpy.types.UILayout, job: Job, index: int, brief: bool = False) -> None:
-    """Draw the progress and buttons of an unfinished job, with what it does, or if `brief`, with its title alone."""
+def draw_running(
+    layout: bpy.types.UILayout, job: Job, index: int, running: Job | None = None, brief: bool = False
+) -> None:
+    """Draw the progress and buttons of an unfinished job.
+
+    Args:
+        layout: where to draw.
+        job: the job.
+        index: its place in the queue.
+        running: the job of the queue that runs, for which others wait.
+        brief: draw its title instead of what it does and warns of.
+    """
     row = layout.row(align=True)
     if job.state is State.WAITING:
-        row.label(text=summary(job), icon="TIME")
+        write(row.column(), summary(job, running), "TIME", inset=_BUTTON)
     else:
         left = time_left(job.seconds_left) if job.seconds_left is not None else ""
         text = {State.PAUSED: "Paused", State.STOPPING: "Saving and stopping"}.get(job.state, left)
@@ -55,6 +72,8 @@ def draw_running(layout: bpy.types.UILayout, job: Job, index: int, brief: bool =
     row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
         write(layout, job.title if brief else f"{job.title}: {activity(job)}")
+    if not brief:
+        _draw_warnings(layout, job.warnings[-_WARNINGS:])
 
 
 def activity(job: Job) -> str:
@@ -102,7 +121,11 @@ def draw_over(layout: bpy.types.UILayout, job: Job) -> None:
         write(layout, after_stop(job), "INFO")
     else:
         write(layout, f"{job.title}: done", "CHECKMARK")
-    for sentence in job.warnings[:3]:
+    _draw_warnings(layout, job.warnings[:3])
+
+
+def _draw_warnings(layout: bpy.types.UILayout, warnings: Iterable[str]) -> None:
+    for sentence in warnings:
         write(layout, in_blender(sentence), "ERROR")
 
 

@@ -154,9 +154,13 @@ def _announce_hidden(job: Job) -> bool:
 
 
 def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Show new frames in the compositors that use their folder; return False."""
+    """Show new frames in the compositors that use their folder, and tell where they are; return False."""
+    folder, count = Path(str(job.result.get("film", ""))), job.result.get("frames")
     for other in bpy.data.scenes:
-        film.show_frames(other, Path(job.result.get("film", "")))
+        film.show_frames(other, folder)
+    if isinstance(count, int):
+        text = " ".join([f"{count} frame{'s are' if count != 1 else ' is'} in {folder}.", *map(in_blender, job.warnings)])
+        messages.show(text, operator="wm.path_open", label="Open Folder", filepath=str(folder))
     return False
 
 
@@ -180,8 +184,8 @@ def _tell_export(job: Job, _owner: bpy.types.Scene | None) -> bool:
 
 
 def _tell_check(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Tell how the backend works; return False."""
-    messages.show(in_blender(job.message))
+    """Tell how the backend works, and what hinders it; return False."""
+    messages.show(" ".join(map(in_blender, [job.message, *job.warnings])))
     return False
 
 
@@ -197,4 +201,5 @@ SHOW_BY_KIND = {
     "fill": _show_fill_job,
     "export": _tell_export,
     "doctor": _tell_check,
+    "setup": _tell_check,
 }

@@ -12,12 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from objectgs.backend.shared.events import Reporter
+from objectgs.objectgs_addon.blender import messages
+from objectgs.objectgs_addon.panels.jobs import JobsPanel
 from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.process.backend_process import BackendProcess, backend_command, backend_environment
 from objectgs.objectgs_addon.process.blocking import run_blocking
 from objectgs.objectgs_addon.process.jobs import Job, JobQueue, State
-from objectgs.objectgs_addon.running import job_display, wording
+from objectgs.objectgs_addon.running import background, job_display, results, wording
 from objectgs.objectgs_addon.running.wording import in_blender
+
+from .drawn import texts_of
 
 posix = pytest.mark.skipif(os.name != "posix", reason="signals and niceness are POSIX's")
 WAIT = 30.0
@@ -635,3 +639,28 @@ def test_a_job_again_uses_the_present_python_and_keeps_its_checkpoint(tmp_path):
     assert job.again(None).command == backend_command(tmp_path / "old", "train", "capture")
     other = Job("Set up", "setup", None, ["python3", "-m", "venv", "--restart"], tmp_path)
     assert other.again(tmp_path / "new").command == other.command
+
+
+def test_panel_tells_warnings_of_a_running_job_and_what_others_wait_for(tmp_path, monkeypatch):
+    """Both matter while a job runs: a training on the processor takes hours."""
+    train, mesh = (Job(title, "train", tmp_path, ["true"], tmp_path) for title in ("Train", "Extract Meshes"))
+    train.state, train.message = State.PAUSED, "Starting"
+    train.warnings = ["One.", "Two.", "A smaller --max-size is faster."]
+    monkeypatch.setattr(background.queue, "jobs", [train, mesh])
+    told = texts_of(JobsPanel)
+    assert "Two. A smaller Image Size is faster." in told and "One." not in told
+    assert "Extract Meshes: waiting for Train (paused)" in told
+
+
+def test_ends_are_told_with_what_was_made(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, **more: told.append((text, more)))
+    film = Job("Film", "film", tmp_path, ["true"], tmp_path)
+    film.result = {"film": str(tmp_path), "frames": 12}
+    results.SHOW_BY_KIND["film"](film, None)
+    opens = {"operator": "wm.path_open", "label": "Open Folder", "filepath": str(tmp_path)}
+    assert told == [(f"12 frames are in {tmp_path}.", opens)]
+    setup = Job("Set up backend", "setup", tmp_path, ["true"], tmp_path)
+    setup.message, setup.warnings = "It works; training uses the CPU.", ["PyTorch's builds could not be reached."]
+    results.SHOW_BY_KIND["setup"](setup, None)
+    assert told[1] == ("It works; training uses the CPU. PyTorch's builds could not be reached.", {})
