@@ -22,6 +22,7 @@ CLASSES = (
     HelpPanel,
     ObjectList,
     CapturePanel,
+    PlacementPanel,
     ObjectsPanel,
     MarkedList,
     MarkingPanel,
@@ -37,7 +38,6 @@ CLASSES = (
     RenderPanel,
     FilmPanel,
     ExportPanel,
-    PlacementPanel,
     JobsPanel,
 )
 """In the order from the capture to the result."""

@@ -339,7 +339,7 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 def _show_poses(job: Job) -> None:
     """Show how many photos have a pose, with a button to use another set of them, or to leave out the weak ones."""
-    text = " ".join([f"{job.title}: {job.message}", *map(in_blender, job.warnings[:_SHOWN_WARNINGS])])
+    text = " ".join(map(in_blender, [f"{job.title}: {job.message}", *job.warnings[:_SHOWN_WARNINGS]]))
     if len(job.warnings) > _SHOWN_WARNINGS:
         text += " The folder sfm of the capture names all of them."
     weak, sets, number = (job.result.get(key) for key in ("weak", "separate_sets", "set"))

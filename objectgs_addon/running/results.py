@@ -159,7 +159,8 @@ def _show_film(job: Job, _owner: bpy.types.Scene | None) -> bool:
     for other in bpy.data.scenes:
         film.show_frames(other, folder)
     if isinstance(count, int):
-        text = " ".join([f"{count} frame{'s are' if count != 1 else ' is'} in {folder}.", *map(in_blender, job.warnings)])
+        where = f"{count} frame{'s are' if count != 1 else ' is'} in {folder}."
+        text = " ".join([where, *map(in_blender, job.warnings)])
         messages.show(text, operator="wm.path_open", label="Open Folder", filepath=str(folder))
     return False
 

@@ -35,6 +35,7 @@ _PHRASES = {
     "which --text and --detector are for": "which Names is for",
     "choose a folder with one as MASKS": "clear Names, or choose a folder with one",
     "`doctor`": "Check Backend",
+    "do not tell its true size.": "do not tell its true size; Set Distance in the panel Placement gives it.",
 }
 """Advice that has other words in Blender."""
 _ONLY_TYPED = (

@@ -71,8 +71,8 @@ MARK = Step(
     "objectgs.start_marking",
     "Mark Objects",
     "GREASEPENCIL",
-    "Without masks: draw over each object, then press Separate Objects. Suggest Objects in a panel below tries it "
-    "without strokes.",
+    "Without masks: draw over each object and what it stands on, then press Separate Objects. Suggest Objects in a "
+    "panel below tries it without strokes.",
 )
 SEPARATE = Step(
     "objectgs.separate_marked",

@@ -15,8 +15,8 @@ class FillHole(bpy.types.Operator):
     bl_idname = "objectgs.fill_hole"
     bl_label = "Fill Hole"
     bl_description = (
-        "Fill the hole that the removed or moved object leaves in the ground or wall from its surroundings. The attribute "
-        f'"{UNOBSERVED}" marks these splats'
+        "Fill the hole that the removed or moved object leaves in the ground or wall from its surroundings. The "
+        f'attribute "{UNOBSERVED}" marks these splats'
     )
     bl_options = {"REGISTER", "UNDO"}
 

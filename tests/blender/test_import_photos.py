@@ -81,9 +81,9 @@ def test_same_sources_continue_in_their_capture(submitted, tmp_path):
 
 @pytest.fixture
 def shown(monkeypatch):
-    """Options of the messages that are shown."""
+    """Texts and options of the messages that are shown."""
     found = []
-    monkeypatch.setattr(background.messages, "show", lambda _text, **options: found.append(options))
+    monkeypatch.setattr(background.messages, "show", lambda text, **options: found.append({"text": text, **options}))
     return found
 
 
@@ -95,8 +95,10 @@ def test_weak_photos_are_left_out(submitted, shown, tmp_path):
     write_source(capture, PhotosSource([tmp_path / "trip"], "one", 12, ["1.jpg"], "objects", 3, matcher=networks))
     job = locations.sfm_job(capture, PhotosSource([tmp_path / "trip"]))
     job.result = {"weak": ["a b.jpg", "2.jpg"], "separate_sets": [], "set": 1}
+    job.message = "2 of 2 photos have a pose. The photos of the scene do not tell its true size."
     background._show_poses(job)
     (options,) = shown
+    assert options.pop("text").endswith("Set Distance in the panel Placement gives it.")
     assert options.pop("label") == "Leave Out 2 Weak Photos" and options.pop("operator") == "objectgs.recompute_poses"
     bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", **options)
     command = submitted[0].command

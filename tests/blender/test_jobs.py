@@ -617,6 +617,9 @@ def test_sentences_have_the_names_that_blender_shows():
     assert in_blender("It is of another capture; use the same one, a different --out, or --restart to start over.") == (
         "It is of another capture; use the same one, or Retrain to start over."
     )
+    assert in_blender("The photos of the scene do not tell its true size.").endswith(
+        "do not tell its true size; Set Distance in the panel Placement gives it."
+    )
     for kept in ("--seed 3", "run pip install torch --out x", "--text-file", "--per-object"):
         assert in_blender(kept) == kept
 

@@ -393,6 +393,23 @@ def test_one_list_of_objects_is_open(root, session):
     assert "OBJECTGS_UL_marked" in texts_of(MarkingPanel)
 
 
+def test_panel_asks_for_the_surroundings_of_a_single_object(root, session):
+    view = views(root)[0]
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    marks.add_stroke(root, 1, view, [(1, 1), (9, 1)], area=False)
+    answer(session, [1], [0] * len(session.keys))
+    assert "mark what it stands on, too" in texts_of(MarkingPanel)
+    marks.add_stroke(root, 2, view, [(5, 5), (9, 5)], area=False)
+    answer(session, [1, 2], [0] * len(session.keys))
+    assert "stands on" not in texts_of(MarkingPanel) and "the next object" in texts_of(MarkingPanel)
+
+
+def test_panel_advises_to_train_before_objects_are_marked(root):
+    assert "Draw over each object in the viewport" in texts_of(MarkingPanel)
+    (blender_scene.folder_of(root) / "splats.ply").unlink()
+    assert "Train first" in texts_of(MarkingPanel)
+
+
 def test_panel_says_why_marks_are_not_shown(root, session):
     assert "not shown" not in texts_of(MarkingPanel)
     bpy.context.scene.objectgs.draw_splats = False

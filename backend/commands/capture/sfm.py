@@ -410,7 +410,11 @@ def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> 
     reporter.done(
         message="{registered} of {photos} photos have a pose{doubtful}, with {points:,} points and a mean reprojection "
         "error of {reprojection_error:.2f} pixels.".format(**report, doubtful=f", {len(weak)} weak" if weak else "")
-        + (" The scene has its true size, by GPS." if report["size_by_gps"] else ""),
+        + (
+            " The scene has its true size, by GPS."
+            if report["size_by_gps"]
+            else " The photos of the scene do not tell its true size."
+        ),
         capture=str(capture),
         picture=str(capture / WORK / PICTURE),
         weak=list(weak),

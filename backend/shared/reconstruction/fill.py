@@ -1,4 +1,4 @@
-"""Fills of the holes that removed and moved objects leave: PLY files in the reconstruction's cache, from `edit` for Blender.
+"""Fills of the holes that objects leave: PLY files in the reconstruction's cache, from `edit` for Blender.
 
 Each row is a splat with the properties of splats.ply and two more: `unobserved` as uchar (1: a new splat, 0: a splat of
 splats.ply that new ones replace) and `fills` as uint32, the ID of the object whose hole it fills. Positions and

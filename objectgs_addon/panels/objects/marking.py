@@ -71,9 +71,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             column.operator("objectgs.start_marking", icon="GREASEPENCIL")
             _draw_suggesting(column, properties)
             if not properties.marked:
-                write(
-                    layout, "Draw over each object in the viewport to separate it from the scene, or let them be found."
-                )
+                write(layout, _how_to_begin(folder_trust.state_of(root).trained))
                 return
         else:
             self._draw_state(layout, root)
@@ -105,15 +103,26 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             write(layout, pointing.message(), rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
+        strokes = marks.strokes_of(root)
+        marked = {stroke["object"] for stroke in strokes} - {marks.NOTHING}
         if waits:
             text = "Finding the objects"
-        elif not marks.strokes_of(root):
+        elif not strokes:
             text = f"Draw over {item.name if item else 'an object'} in the viewport."
+        elif not nothing and len(marked) == 1:
+            # The border between two things is found best where both are marked.
+            text = "Press Tab to mark what it stands on, too. Hold Ctrl and draw where the color is on something else."
         elif not nothing:
             text = "Press Tab for the next object. Hold Ctrl and draw where the color is on something else."
         else:
             text = f"Press Tab for the next object. {nothing} stroke{'s' if nothing != 1 else ''} on no object."
         write(layout, text, "INFO", rows=_ROWS)
+
+
+def _how_to_begin(is_trained: bool) -> str:
+    if not is_trained:
+        return "Train first: marks are found best on splats. Strokes drawn now are kept."
+    return "Draw over each object in the viewport to separate it from the scene, or let them be found."
 
 
 def _why_hidden(context: bpy.types.Context) -> str:
