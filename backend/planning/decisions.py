@@ -63,8 +63,8 @@ class PlanningContext:
     of the masks. point_ids: (M,) int64, the points' objects; None before a vote. in_background: (M,) bool, the points
     that no mask, or hardly any, shows on an object; None: those without an object. thorough: whether to read all
     photos, however many. plan: the decisions so far, with the user's overrides. resumed: the plan of the training that
-    is resumed, which keeps the views that it was begun with; None for a new one. check: called at intervals; ends the
-    planning by an exception once the user wants to stop.
+    is resumed, which keeps the views that it was begun with, and stays without masks if it was begun so; None for a new
+    one. check: called at intervals; ends the planning by an exception once the user wants to stop.
     """
 
     capture: Capture
@@ -150,7 +150,9 @@ def planned_settings(settings: Settings, plan: Plan) -> Settings:
 
 def _votes(context: PlanningContext) -> Decision:
     views, masks = context.capture.views, sum(view.mask_file is not None for view in context.capture.views)
-    what = "objects from the masks"
+    what, begun = "objects from the masks", context.resumed["votes"] if context.resumed is not None else None
+    if masks and begun is not None and begun.planned is False:
+        return Decision("votes", what, False, "the training was begun without masks", can_override=False)
     if not masks:
         return Decision("votes", what, False, "the capture has no masks", can_override=False)
     return Decision("votes", what, True, f"{masks} of {len(views)} views have masks")

@@ -102,7 +102,7 @@ class _Session:
         elif kind == "answer" and event.get("ready"):
             self.ready = event.get("splats") == len(self.keys)
             if not self.ready:
-                self.failure = "The splats in the folder are not those of its training; train again."
+                self.failure = "The splats in the folder are not those of its training; train or separate again."
         elif kind == "answer" and event.get("request") == self.asked:
             self.is_proposing = False
             if "proposed" in event:

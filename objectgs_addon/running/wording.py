@@ -34,6 +34,7 @@ _PHRASES = {
     "or use `masks`": "or use Import Masks",
     "which --text and --detector are for": "which Names is for",
     "choose a folder with one as MASKS": "clear Names, or choose a folder with one",
+    "`clean-labels`": "Clean Up Labels",
     "`doctor`": "Check Backend",
     "do not tell its true size.": "do not tell its true size; Set Distance in the panel Placement gives it.",
 }

@@ -19,12 +19,14 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from backend.capture import load_capture
+from backend.commands.objects import label
 from backend.commands.objects.pointable import open_pointable
 from backend.export.ply import read_splats
 from backend.model.anchors import Anchors
 from backend.model.checkpoint import save_checkpoint
 from backend.model.draw import draw
 from backend.model.object_model import Normalization
+from backend.planning import decisions
 from backend.pointing.clusters import FEW, Clusters, between_clusters, nested_clusters, no_clusters
 from backend.pointing.color_model import SPREAD, ColorModel
 from backend.pointing.mask_edges import follow_edges
@@ -40,10 +42,11 @@ from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Can
 from backend.shared.events import Reporter
 from backend.shared.formats.points_ply import read_points
 from backend.shared.reconstruction.folder import Reconstruction
-from backend.shared.reconstruction.objects import edit_objects
+from backend.shared.reconstruction.objects import edit_objects, read_objects
 from backend.shared.reconstruction.record import read_record
 from backend.training.fine_tuning.relabel import relabeled
 from backend.training.scene import Scene
+from backend.training.settings import Settings
 from backend.training.state import load_model, read_checkpoint
 from backend.training.trainer import Trainer
 
@@ -404,9 +407,11 @@ def test_cameras_around_splats_show_them_from_above_and_from_free_places() -> No
 
 
 def test_label_that_is_stopped_keeps_the_objects(unlabeled, tmp_path, run_command, monkeypatch) -> None:
+    """The splats have their objects before the training of borders, so that it may also end in other ways."""
     scene, out = unlabeled
 
     def stopped(trainer, budget, folder, *_, **__):
+        assert {1, 2, 5} <= set(read_splats(out / "splats.ply")[0].object_ids.tolist())
         trainer.save(folder)
         raise Cancelled("Stopped")
 
@@ -416,6 +421,59 @@ def test_label_that_is_stopped_keeps_the_objects(unlabeled, tmp_path, run_comman
     assert result.code == EXIT_CANCELLED
     assert {1, 2, 5} <= set(read_splats(out / "splats.ply")[0].object_ids.tolist())
     assert run_command("train", scene.folder, "--out", out, "--steps", 160, "--offsets", 4).code == EXIT_DONE
+
+
+def test_label_is_not_stopped_while_the_folder_follows_its_masks(unlabeled, tmp_path, run_command, monkeypatch) -> None:
+    """The training goes on afterward, with the choices that it was begun with."""
+    scene, out = unlabeled
+    train = ("train", scene.folder, "--out", out, "--offsets", 4, "--leave-out", "exposure", "--steps")
+    assert run_command(*train, 10, "--restart").code == EXIT_DONE
+
+    def write_and_stop(*arguments):
+        write_masks(*arguments)
+        arguments[-1].stop._stopped = True
+
+    write_masks = label._write_masks
+    with monkeypatch.context() as context:
+        context.setattr(label, "_write_masks", write_and_stop)
+        result = run_command("label", out, "--strokes", strokes_file(tmp_path, strokes_on(scene, (1, 5))))
+    assert result.code == EXIT_CANCELLED
+    assert {1, 2, 5} <= set(read_splats(out / "splats.ply")[0].object_ids.tolist())
+    assert [entry.id for entry in read_objects(out / "objects.json")] == [1, 2, 5]
+    assert run_command(*train, 12).code == EXIT_DONE
+
+
+def test_training_goes_on_after_a_label_whose_masks_teach_nothing(
+    unlabeled, tmp_path, run_command, monkeypatch
+) -> None:
+    """More objects later are learned again."""
+    scene, out = unlabeled
+    content = strokes_on(scene, (1, 5))
+    one = {**content, "strokes": [stroke for stroke in content["strokes"] if stroke["object"] == 1]}
+    train = ("train", scene.folder, "--out", out, "--offsets", 4, "--steps")
+    with monkeypatch.context() as context:
+        context.setattr(decisions, "background_is_masked", lambda _: False)
+        assert run_command("label", out, "--strokes", strokes_file(tmp_path, one)).code == EXIT_DONE
+        assert read_record(Reconstruction(out)).training.settings["semantic_weight"] == 0
+        assert run_command(*train, 190).code == EXIT_DONE
+    assert run_command("label", out, "--strokes", strokes_file(tmp_path, content)).code == EXIT_DONE
+    assert read_record(Reconstruction(out)).training.settings["semantic_weight"] == Settings().semantic_weight
+    assert run_command(*train, 240).code == EXIT_DONE
+
+
+def test_another_training_of_a_capture_goes_on_without_masks_of_strokes(unlabeled, tmp_path, run_command) -> None:
+    """Its list of objects stays as it is."""
+    scene, out = unlabeled
+    other = tmp_path / "other"
+    train = ("train", scene.folder, "--out", other, "--offsets", 4, "--steps")
+    assert run_command(*train, 4).code == EXIT_DONE
+    listed = (other / "objects.json").read_bytes()
+    assert run_command("label", out, "--strokes", strokes_file(tmp_path, strokes_on(scene, (1, 5)))).code == EXIT_DONE
+    result = run_command(*train, 6, "--json")
+    assert result.code == EXIT_DONE and (other / "objects.json").read_bytes() == listed
+    assert "are not used, since the training was begun without masks" in " ".join(result.messages("warning"))
+    assert read_splats(other / "splats.ply")[0].object_ids.max() == 0
+    assert_rejected(run_command(*train, 8, "--keep", "votes"), "--keep votes is not possible", "without masks")
 
 
 def test_relabeled_splats_are_the_same_splats(unlabeled) -> None:

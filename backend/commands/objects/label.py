@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 from ...capture import Capture, load_capture
 from ...capture.made_masks import new_masks, write_mask
 from ...model.splats import Splats
-from ...planning.decisions import Choices, decide, planned_capture
+from ...planning.decisions import Choices, decide, planned_capture, planned_settings
 from ...pointing.pointer import Pointer
 from ...pointing.strokes import Strokes, read_strokes
 from ...shared.errors import Cancelled, InputError
@@ -22,7 +23,7 @@ from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import STROKES, Reconstruction
 from ...shared.reconstruction.objects import default_name, forget_vanished
 from ...shared.reconstruction.plan import write_plan
-from ...shared.reconstruction.record import update_record
+from ...shared.reconstruction.record import TrainingRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.fine_tuning.relabel import begin_with_labels, budget_of_labels
 from ...training.settings import Settings
@@ -164,11 +165,14 @@ def _write_masks(
 def begin_border_training(
     trained: Trained, source: np.ndarray, ids: np.ndarray, options: argparse.Namespace, reporter: StoppingReporter
 ) -> Trainer:
-    """Vote with the masks, plan anew, give the splats their IDs, and save that as the folder's training."""
-    folder, before = trained.folder, trained.training
-    settings, votes = Settings(**before.settings), before.votes
-    capture = load_capture(trained.capture.folder, folder.cache, memory_for_files(options), votes.max_size, reporter)
-    voting = argparse.Namespace(strategy=votes.strategy, seed=settings.seed, max_size=votes.max_size)
+    """Vote with the masks, plan anew, give the splats their IDs, and save that as the folder's training and splats.
+
+    Nothing in it can be stopped: the masks have been replaced, and the folder has to follow.
+    """
+    folder, before, going_on = trained.folder, trained.training, reporter.reporter
+    wanted, votes = _choices_of(before), before.votes
+    capture = load_capture(trained.capture.folder, folder.cache, memory_for_files(options), votes.max_size, going_on)
+    voting = argparse.Namespace(strategy=votes.strategy, seed=wanted.settings.seed, max_size=votes.max_size)
     # What is far from all strokes has no object, which is no reason for a warning.
     cast_votes(folder, capture, voting, Reporter())
     # An object that was unchecked since the training has splats, and is separated from the others, too.
@@ -176,26 +180,51 @@ def begin_border_training(
         replace(entry, left_out=entry.left_out and entry.id in before.left_out)
         for entry in find_requested_objects(folder, capture)[0]
     ]
-    wanted = Choices(settings, votes.max_size, until_converged=before.preset == "final")
+    begun = plan_of(before).without("votes")
     points = read_points(folder.points)
-    context = build_context(capture, wanted, objects, reporter, points, thorough=True, resumed=plan_of(before))
-    plan = decide(context).settled_by(plan_of(before))
+    context = build_context(capture, wanted, objects, going_on, points, thorough=True, resumed=begun)
+    plan = decide(context).settled_by(begun)
     planned = planned_capture(context.capture, plan)
+    semantic_weight = planned_settings(wanted.settings, plan).semantic_weight
     trainer = begin_with_labels(
         source, ids, planned, folder.checkpoint, memory_for_targets(options), trained.model.device,
-        trained.scene.gains, planned.has_masks and plan.does("rest"),
+        trained.scene.gains, planned.has_masks and plan.does("rest"), semantic_weight,
     )  # fmt: skip
     trainer.save(folder.checkpoint)
     (folder.checkpoint / PREVIOUS).unlink(missing_ok=True)
     outdate_results(folder)
     write_plan(folder.plan, plan)
-    key = votes_key(planned, votes.max_size, votes.strategy, settings.seed)
-    update_record(folder, training=replace(before, left_out=planned.left_out.tolist(), votes=key, plan=plan.as_list()))
+    key = votes_key(planned, votes.max_size, votes.strategy, wanted.settings.seed)
+    settings = {**before.settings, "semantic_weight": semantic_weight}
+    left_out = planned.left_out.tolist()
+    update_record(
+        folder, training=replace(before, settings=settings, left_out=left_out, votes=key, plan=plan.as_list())
+    )
+    # The training may end in any way; what there is to say about its result is said after it.
+    export_model(trainer.shown, trainer.scene, folder, Reporter(), compare=False)
     return trainer
 
 
+def _choices_of(training: TrainingRecord) -> Choices:
+    """Return the user's choices for a training, for a plan with other masks."""
+    settings, plan = Settings(**training.settings), plan_of(training)
+    labels = plan["labels"]
+    if settings.semantic_weight == 0 and labels is not None and labels.can_override:
+        # There was nothing to learn from the masks so far; otherwise the user has chosen it.
+        settings = replace(settings, semantic_weight=Settings().semantic_weight)
+    overridden = [decision for decision in plan.without("votes").decisions if decision.overridden]
+    return Choices(
+        settings,
+        training.votes.max_size,
+        meshes=plan.does("meshes"),
+        keep=[decision.key for decision in overridden if decision.done],
+        leave_out=[decision.key for decision in overridden if not decision.done],
+        until_converged=training.preset == "final",
+    )
+
+
 def train_borders(trained: Trained, trainer: Trainer, reporter: StoppingReporter) -> None:
-    """Train with the masks, and export the model; also if the training is stopped."""
+    """Train with the masks, and export the model; also if the training is stopped or fails."""
     folder, before = trained.folder, trainer.progress.seconds
     budget = budget_of_labels(trainer.progress.step)
     reporter.begin(_TRAIN, "Training the objects' borders")
@@ -203,6 +232,10 @@ def train_borders(trained: Trained, trainer: Trainer, reporter: StoppingReporter
         trainer.run(budget, folder.checkpoint, reporter.reporter, stop=reporter.stop)
     except Cancelled:
         export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
+        raise
+    except (InputError, OSError):
+        with suppress(InputError, OSError):
+            export_model(trainer.shown, trainer.scene, folder, reporter, compare=False)
         raise
     finish_stage(folder, "label training", trainer.progress.seconds - before)
     export_model(trainer.shown, trainer.scene, folder, reporter)

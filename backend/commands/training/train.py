@@ -156,15 +156,16 @@ def _begin(
 ) -> tuple[Trainer, Plan]:
     """Resume the folder's training or start one, with a new vote if necessary; return the trainer and the plan."""
     resuming = not options.restart and has_checkpoint(folder.checkpoint)
-    voters = capture.without_masks() if "votes" in options.leave_out else capture
+    voters, before = capture.without_masks() if "votes" in options.leave_out else capture, None
     if resuming:
         _check_same_capture(folder, capture, options)
+        before = plan_of(read_record(folder).training)
+        voters = _without_new_masks(voters, before, reporter)
     if not votes_are_current(folder, voters, options.max_size, options.strategy, options.seed):
         cast_votes(folder, voters, options, reporter)
     reporter.begin("plan", "Planning the training")
     points = read_points(folder.points)
     objects, _ = find_requested_objects(folder, capture, options)
-    before = plan_of(read_record(folder).training) if resuming else None
     context = build_context(capture, choices(options), objects, reporter, points, thorough=True, resumed=before)
     assert context.point_ids is not None
     plan = decide(context)
@@ -270,6 +271,18 @@ def _check_same_capture(folder: Reconstruction, capture: Capture, options: argpa
         raise InputError(f"{folder.checkpoint} was trained with --max-size {votes.max_size}; {otherwise}")
     if votes.strategy != options.strategy:
         raise InputError(f"{folder.checkpoint} was trained with --strategy {votes.strategy}; {otherwise}")
+
+
+def _without_new_masks(capture: Capture, before: Plan, reporter: Reporter) -> Capture:
+    """Return the capture without its masks if it had none when the training with the plan `before` was begun."""
+    votes = before["votes"]
+    if not capture.has_masks or votes is None or votes.planned is not False:
+        return capture
+    reporter.warning(
+        f"The masks in {capture.folder / 'masks'} are not used, since the training was begun without masks; "
+        "`clean-labels` gives its splats their objects, and --restart trains with them."
+    )
+    return capture.without_masks()
 
 
 def _check_same_plan(folder: Reconstruction, capture: Capture, plan: Plan) -> None:

@@ -105,6 +105,10 @@ class Plan:
         decision = self["validation-views"]
         return decision.views if decision is not None and decision.done is False else ()
 
+    def without(self, key: str) -> Plan:
+        """Return the plan without a decision, which is to be made anew."""
+        return Plan(tuple(decision for decision in self.decisions if decision.key != key))
+
     def overridden(self, keep: Iterable[str], leave_out: Iterable[str]) -> Plan:
         """Return the plan with the user's overrides.
 

@@ -50,6 +50,7 @@ def begin_with_labels(
     device: torch.device,
     gains: np.ndarray,
     supervise_background: bool,
+    semantic_weight: float,
 ) -> Trainer:
     """Continue a training with other object IDs.
 
@@ -59,6 +60,7 @@ def begin_with_labels(
         capture: the capture that it was trained on, with masks of the objects.
         checkpoint: folder of its checkpoint, which is not changed.
         memory_mb, device, gains, supervise_background: as in `Trainer.start`.
+        semantic_weight: weight of the loss of the IDs from now on.
 
     Returns:
         A trainer to run with `budget_of_labels`.
@@ -67,7 +69,8 @@ def begin_with_labels(
         InputError: the checkpoint cannot be read.
     """
     tensors, state, _ = require_checkpoint(checkpoint)
-    state = {**state, "supervise_background": supervise_background}
+    settings = {**state["settings"], "semantic_weight": semantic_weight}
+    state = {**state, "settings": settings, "supervise_background": supervise_background}
     plateau = {"watched": [], "grown": False, "converged_at": 0, "ends_at": 0, "limited": False}
     state["progress"] = {**state["progress"], **plateau}
     return Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
