@@ -14,11 +14,12 @@ from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.record import read_record
 from .. import film, scene
 from ..blender import messages
-from ..environment import known_folders
+from ..environment import known_folders, locations
+from ..picking import marks
 from ..process.jobs import Job
 from ..state import folder_trust, object_edits, object_list
 from ..state import viewports as view
-from ..state.folder_state import folder_state
+from ..state.folder_state import folder_state, reconstruction_for
 from .wording import in_blender
 
 
@@ -40,9 +41,12 @@ def roots_of(folder: Path | None) -> list[bpy.types.Collection]:
 
 
 def trained_on(capture: Path) -> list[str]:
-    """Return the names of the reconstructions in this file that were trained on a capture."""
+    """Return the names of the reconstructions that were trained on a capture: of those in this file, and of the one
+    that it was imported to."""
     roots = [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]
-    states = ((root.name, folder_trust.state_of(root)) for root in roots if folder_trust.is_accepted(root))
+    folders = {scene.folder_of(root): root.name for root in roots if folder_trust.is_accepted(root)}
+    own = reconstruction_for(capture, locations.new_reconstruction)
+    states = ((name, folder_state(folder)) for folder, name in {own: own.name, **folders}.items())
     return sorted(name for name, state in states if state.steps and state.capture == capture)
 
 
@@ -56,6 +60,14 @@ def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Coll
 
 
 def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
+    """Show a capture and, where they are not shown yet, the splats that were trained on it before."""
+    shown = _show_points(job, owner)
+    if not all(map(scene.object_collections, _shown_roots(job, owner))):
+        _show_result(job, owner)
+    return shown
+
+
+def _show_points(job: Job, owner: bpy.types.Scene | None) -> bool:
     known_folders.remember(_folder_of(job))
     capture = folder_state(_folder_of(job)).capture
     if capture is not None and known_folders.is_remote(capture):
@@ -69,6 +81,7 @@ def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
         if root is None:
             root = view.show_first(owner, _folder_of(job))
             object_edits.fill(root)
+            marks.restore(root, _folder_of(job))
             roots.append(root)
         owner.objectgs.active = root
         imported = read_record(Reconstruction(_folder_of(job))).capture
@@ -82,7 +95,7 @@ def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 def _show_imported(job: Job, owner: bpy.types.Scene | None) -> bool:
     """Show imported splats, for which cameras and points are optional."""
-    return _show_capture(job, owner) and _show_result(job, owner)
+    return _show_points(job, owner) and _show_result(job, owner)
 
 
 def _show_votes(job: Job, owner: bpy.types.Scene | None) -> bool:

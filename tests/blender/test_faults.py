@@ -503,6 +503,7 @@ def test_results_are_shown_in_their_scenes(extension, folder, trained, tmp_path)
     first = bpy.context.scene
     second, third = bpy.data.scenes.new("second"), bpy.data.scenes.new("third")
     other = Path(shutil.copytree(trained, tmp_path / "other"))
+    (folder / "splats.ply").unlink()
     jobs = [
         start(job(tmp_path, kind="import", folder=folder, title="a"), first),
         start(job(tmp_path, kind="import", folder=other, title="b"), second),
@@ -517,6 +518,11 @@ def test_results_are_shown_in_their_scenes(extension, folder, trained, tmp_path)
         roots = [child for child in owner.collection.children_recursive if scene.kind_of(child) == "reconstruction"]
         assert roots == [owner.objectgs.active] and scene.folder_of(roots[0]) == place
     assert scene.object_collections(second.objectgs.active) and not scene.object_collections(first.objectgs.active)
+
+
+def test_import_shows_what_was_trained_before(extension, folder, tmp_path):
+    run(job(tmp_path, kind="import", folder=folder), bpy.context.scene)
+    assert scene.object_collections(bpy.context.scene.objectgs.active)
 
 
 @pytest.mark.parametrize("kind", ["import", "vote", "train"])
