@@ -19,6 +19,8 @@ import bpy
 
 from ...backend.shared.console import ConsoleReporter
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.record import read_record
 from .. import scene
 from ..blender import messages, writing
 from ..environment import environment, locations
@@ -324,17 +326,22 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
         first = "set up the backend, then use" if locations.backend_python() is None else "use"
         messages.show(f"The new capture is in {job.folder}; {first} Import Capture, and open this folder")
         return False
-    if job.kind == "sfm":
-        folder = reconstruction_for(job.folder, locations.new_reconstruction)
-    else:
-        folder = locations.reconstructions_folder() / "demo"
-    name = folder.name
-    submit(
-        locations.backend_job(f"Import {name}", "import", folder, "import", str(job.folder), "--out", str(folder)),
-        owner,
-        lambda _kind, text: messages.show(text, "ERROR"),
-    )
+    demo = locations.reconstructions_folder() / "demo" if job.kind == "demo" else None
+    submit(import_job(job.folder, demo), owner, lambda _kind, text: messages.show(text, "ERROR"))
     return False
+
+
+def import_job(capture: Path, folder: Path | None = None) -> Job:
+    """Return a job that imports a capture, with images of the size of an earlier import.
+
+    folder: the reconstruction's folder; None: that of an earlier import, or a new one.
+    """
+    folder = folder or reconstruction_for(capture, locations.new_reconstruction)
+    before = read_record(Reconstruction(folder)).capture
+    size = [] if before is None else ["--max-size", str(before.max_size)]
+    return locations.backend_job(
+        f"Import {folder.name}", "import", folder, "import", str(capture), "--out", str(folder), *size
+    )
 
 
 def _show_poses(job: Job) -> None:

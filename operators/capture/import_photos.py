@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import photos or a video alone: where they were taken is computed in the background, and the capture is imported."""
 
+import json
 from pathlib import Path
 
 import bpy
 from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource
+from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource, has_poses, has_poses_of
+from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import locations
-from ...objectgs_addon.running import background
+from ...objectgs_addon.running import background, results
 from ..common import need
 from ..common.import_dialog import ImportDialog
 from ..common.reporting import reports_errors
@@ -83,16 +85,32 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         sources = self._sources()
-        capture = Path(bpy.path.abspath(self.folder)).resolve() if self.folder else locations.new_capture(sources)
+        capture = Path(bpy.path.abspath(self.folder)) if self.folder else locations.new_capture(sources)
+        capture = capture.resolve()
         need.require_unused(capture)
         calibration = Path(bpy.path.abspath(self.calibration)).resolve() if self.calibration else None
         if calibration is not None and not calibration.exists():
             raise InputError(f"{calibration} does not exist; choose another calibration")
-        job = locations.sfm_job(
-            capture,
-            PhotosSource(sources, self.cameras, self.frames or None, features=self.features, calibration=calibration),
+        wanted = PhotosSource(
+            sources, self.cameras, self.frames or None, features=self.features, calibration=calibration
         )
-        return background.submit(job, context.scene, self.report)
+        again = {"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(capture)}
+        if has_poses_of(capture, wanted):
+            job = background.import_job(capture)
+            need.require_unused(job.folder)
+            messages.show(f"The poses of these photos are in {capture} already, and are imported as they are.", **again)
+            return background.submit(job, context.scene, self.report)
+        names = results.trained_on(capture) if has_poses(capture) else []
+        if names:
+            messages.show(
+                f"The photos or settings are not those that the poses in {capture} were computed with, and the "
+                f"training of {', '.join(names)} cannot go on with other poses. Compute the poses again, or go on with "
+                "what was trained by Open Reconstruction.",
+                source=json.dumps(wanted.as_dict()),
+                **again,
+            )
+            return {"CANCELLED"}
+        return background.submit(locations.sfm_job(capture, wanted), context.scene, self.report)
 
     def _sources(self) -> list[Path]:
         """Return the folder, or the files selected in it."""

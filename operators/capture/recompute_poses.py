@@ -9,7 +9,7 @@ import bpy
 from bpy.props import IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.photos_source import read_source
+from ...backend.shared.formats.photos_source import PhotosSource, read_source
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background, results
 from ..common import need
@@ -30,6 +30,10 @@ class RecomputePoses(bpy.types.Operator):
     photo_set: IntProperty(
         name="Set", description="Set of photos to use if nothing connects several, 1 for the largest. 0: as before",
         min=0, options={"SKIP_SAVE"},
+    )  # fmt: skip
+    source: StringProperty(
+        name="Photos", description="Photos and settings as JSON, as in sfm/source.json. If empty, as before",
+        options={"SKIP_SAVE"},
     )  # fmt: skip
 
     @classmethod
@@ -52,7 +56,7 @@ class RecomputePoses(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         capture = Path(self.capture)
-        source = read_source(capture)
+        source = PhotosSource.of(json.loads(self.source)) if self.source else read_source(capture)
         if source is None:
             raise InputError(f"{capture} was not made by Import Photos or Video; import the photos again")
         need.require_unused(capture)

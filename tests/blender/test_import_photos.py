@@ -2,7 +2,10 @@
 """Import Photos or Video: what the backend is asked for, of a folder, chosen photos and a video."""
 
 import json
+import os
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,8 +13,10 @@ bpy = pytest.importorskip("bpy")
 
 import objectgs as extension
 from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
+from objectgs.backend.shared.reconstruction.folder import Reconstruction
+from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_record
 from objectgs.objectgs_addon.environment import locations
-from objectgs.objectgs_addon.running import background
+from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_photos
 
 
@@ -127,6 +132,52 @@ def test_another_set_of_photos_is_used(submitted, shown, tmp_path, used, label, 
     command = submitted[0].command
     assert "--leave-out" not in command
     assert command[command.index("--set") + 1] == number if number else "--set" not in command
+
+
+@pytest.fixture
+def computed(submitted, tmp_path):
+    """A capture with poses of the photos in a folder."""
+    capture = tmp_path / "user" / "captures" / "trip"
+    (capture / "sparse" / "0").mkdir(parents=True)
+    (capture / "sfm").mkdir()
+    write_source(capture, PhotosSource([tmp_path / "trip"], features="objects", leave_out=["1.jpg"]))
+    report = capture / "sfm" / "sfm.json"
+    report.write_text("{}")
+    newest = max(each.stat().st_ctime_ns for each in (tmp_path / "trip", *(tmp_path / "trip").iterdir()))
+    os.utime(report, ns=(newest, newest))
+    return capture
+
+
+def test_photos_with_poses_are_imported_as_they_are(submitted, computed, shown, tmp_path):
+    def imported(**options):
+        bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"), **options)
+        return submitted.pop()
+
+    job = imported()
+    assert job.kind == "import" and job.folder == tmp_path / "user" / "trip"
+    assert job.command[job.command.index("import") + 1] == str(computed) and "--max-size" not in job.command
+    assert shown == [{"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(computed)}]
+    job.folder.mkdir()
+    update_record(Reconstruction(job.folder), capture=CaptureRecord(str(computed), 800, "digest"))
+    assert imported().command[-3:-1] == ["--max-size", "800"]
+    assert imported(cameras="one").kind == "sfm"
+    time.sleep(0.05)
+    (tmp_path / "trip" / "c.jpg").write_bytes(b"")
+    assert imported().kind == "sfm"
+
+
+def test_new_poses_for_a_training_are_asked_about(submitted, computed, shown, tmp_path, monkeypatch):
+    """The training need not be in this file."""
+    monkeypatch.setattr(results, "folder_state", lambda _folder: SimpleNamespace(steps=100, capture=computed))
+    assert results.trained_on(computed) == ["trip"]
+    bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"), cameras="one")
+    assert not submitted
+    (options,) = shown
+    assert options.pop("label") == "Compute Poses Again" and options.pop("operator") == "objectgs.recompute_poses"
+    bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", **options)
+    (job,) = submitted
+    assert job.kind == "sfm" and job.command[job.command.index("--cameras") + 1] == "one"
+    assert "--leave-out" not in job.command
 
 
 def test_names_that_are_too_long_for_a_command_line_are_given_in_a_file(submitted, tmp_path):

@@ -610,6 +610,8 @@ def test_sentences_have_the_names_that_blender_shows():
     assert in_blender("It may take 9 GB; close other programs, or use a smaller --memory-mb or --max-size.") == (
         "It may take 9 GB; close other programs, or use a smaller Image Size."
     )
+    masks = "`clean-labels` gives its splats their objects, and --restart trains with them."
+    assert in_blender(masks) == "Clean Up Labels gives its splats their objects, and Retrain trains with them."
     assert in_blender("The GPU failed; `doctor` tests the GPU.") == "The GPU failed; Check Backend tests the GPU."
     assert in_blender("It has another plan; use the same --keep and --leave-out, or --restart to start over.") == (
         "It has another plan; set the check boxes of the panel Plan as they were, or Retrain to start over."

@@ -7,18 +7,22 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..errors import InputError
 from .json_file import read_json, write_json
+from .regular_file import is_file, is_folder
 
 WORK = "sfm"
 """Folder in the capture for what the computation of poses keeps."""
 REPORT = "sfm.json"
 """File there about the poses that were found."""
 SOURCE = "source.json"
+SPARSE = Path("sparse", "0")
+"""Folder in the capture for the poses and points."""
 
 # Suffixes in lower case
 
@@ -61,30 +65,24 @@ class PhotosSource:
     calibration: Path | None = None
     matcher: Path | None = None
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the arguments as a dict for JSON."""
+        return {
+            "photos": [str(path.resolve()) for path in self.photos],
+            "cameras": self.cameras,
+            "frames": self.frames,
+            "leave_out": self.leave_out,
+            "features": self.features,
+            "set": self.set,
+            "calibration": None if self.calibration is None else str(self.calibration.resolve()),
+            "matcher": None if self.matcher is None else str(self.matcher.resolve()),
+        }
 
-def write_source(capture: Path, source: PhotosSource) -> None:
-    """Write sfm/source.json of a capture."""
-    write_json(
-        capture / WORK / SOURCE,
-        {
-            "photos": [str(path.resolve()) for path in source.photos],
-            "cameras": source.cameras,
-            "frames": source.frames,
-            "leave_out": source.leave_out,
-            "features": source.features,
-            "set": source.set,
-            "calibration": None if source.calibration is None else str(source.calibration.resolve()),
-            "matcher": None if source.matcher is None else str(source.matcher.resolve()),
-        },
-    )
-
-
-def read_source(capture: Path) -> PhotosSource | None:
-    """Read sfm/source.json of a capture; return None if it is missing or invalid."""
-    try:
-        stored = read_json(capture / WORK / SOURCE)
+    @classmethod
+    def of(cls, stored: Mapping[str, Any]) -> PhotosSource:
+        """Return the arguments from the result of `as_dict`; raise KeyError, TypeError or ValueError if invalid."""
         frames, calibration, matcher = stored.get("frames"), stored.get("calibration"), stored.get("matcher")
-        return PhotosSource(
+        return cls(
             [Path(path) for path in stored["photos"]],
             str(stored.get("cameras", "auto")),
             None if frames is None else int(frames),
@@ -94,8 +92,46 @@ def read_source(capture: Path) -> PhotosSource | None:
             None if calibration is None else Path(calibration),
             None if matcher is None else Path(matcher),
         )
+
+
+def write_source(capture: Path, source: PhotosSource) -> None:
+    """Write sfm/source.json of a capture."""
+    write_json(capture / WORK / SOURCE, source.as_dict())
+
+
+def read_source(capture: Path) -> PhotosSource | None:
+    """Read sfm/source.json of a capture; return None if it is missing or invalid."""
+    try:
+        return PhotosSource.of(read_json(capture / WORK / SOURCE))
     except (InputError, AttributeError, KeyError, TypeError, ValueError):
         return None
+
+
+def has_poses(capture: Path) -> bool:
+    """Return whether the poses of a capture were computed from photos alone."""
+    return is_file(capture / WORK / REPORT) and is_folder(capture / SPARSE)
+
+
+def has_poses_of(capture: Path, wanted: PhotosSource) -> bool:
+    """Return whether a capture has poses that were computed as wanted, and no file that they depend on is newer.
+
+    Photos to leave out, the set and the networks may be others.
+    """
+    stored = read_source(capture)
+    if stored is None or not has_poses(capture):
+        return False
+    features = stored.features if wanted.features == "auto" else wanted.features
+    own = replace(wanted, features=features, leave_out=stored.leave_out, set=stored.set, matcher=stored.matcher)
+    if own != stored:
+        return False
+    sources = [*wanted.photos, *([] if wanted.calibration is None else [wanted.calibration])]
+    try:
+        computed = (capture / WORK / REPORT).stat().st_mtime_ns
+        # What was copied there keeps its time of modification, and a folder tells what was removed.
+        found = [each.stat() for path in sources for each in (path, *path.rglob("*"))]
+    except OSError:
+        return False
+    return all(max(each.st_mtime_ns, each.st_ctime_ns) <= computed for each in found)
 
 
 class PhotoError(NamedTuple):
