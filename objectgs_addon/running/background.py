@@ -22,7 +22,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.record import read_record
 from .. import scene
-from ..blender import messages, writing
+from ..blender import messages, undo, writing
 from ..environment import environment, locations
 from ..process.blocking import run_blocking
 from ..process.jobs import Job, JobQueue, State
@@ -298,7 +298,7 @@ def finish(job: Job) -> None:
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == submitted_in), None)
     show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
     if show is not None and show(job, owner):
-        _push_undo(job.title)
+        undo.push(job.title)
     pointing.show()  # A filled hole adds splats to those that are marked.
     if job.kind == "packages":
         _go_on(job, owner)
@@ -386,13 +386,6 @@ def _assign_objects(job: Job, owner: bpy.types.Scene) -> None:
             *options,
         )  # fmt: skip
     submit(follow, owner, lambda _kind, text: messages.show(text, "ERROR"))
-
-
-def _push_undo(title: str) -> None:
-    windows = bpy.context.window_manager.windows
-    if windows and not bpy.app.background:
-        with bpy.context.temp_override(window=windows[0]):
-            bpy.ops.ed.undo_push(message=f"ObjectGS: {title}")
 
 
 def stop() -> None:

@@ -24,14 +24,14 @@ _before: dict[int, object_list.State] = {}
 @writing.allowed
 def _leaving(*_: Any) -> None:
     """Write pending colors before another .blend is opened."""
-    object_edits.flush()
+    object_edits.flush(is_shown=False)
 
 
 @bpy.app.handlers.persistent
 @writing.allowed
 def _undoing(*_: Any) -> None:
     """Write pending colors, and remember what undo or redo may change."""
-    object_edits.flush()
+    object_edits.flush(is_shown=False)
     _before.clear()
     _before.update({root.session_uid: object_list.state_of(root) for root in _accepted_roots()})
 

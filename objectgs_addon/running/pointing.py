@@ -18,7 +18,7 @@ import numpy as np
 from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from .. import drawing, scene
-from ..blender import messages, writing
+from ..blender import messages, undo, writing
 from ..environment import locations
 from ..picking import marks
 from ..process.backend_process import BackendProcess
@@ -374,10 +374,7 @@ def _show_proposed(root: bpy.types.Collection, session: _Session) -> None:
         f"{len(root.objectgs.marked)} objects were found. Remove those that are none, merge parts, and draw over what "
         "is missing; then press Separate Objects. Another Detail gives more or fewer"
     )
-    windows = bpy.context.window_manager.windows
-    if windows and not bpy.app.background:
-        with bpy.context.temp_override(window=windows[0]):
-            bpy.ops.ed.undo_push(message="ObjectGS: Suggest Objects")
+    undo.push("Suggest Objects")
 
 
 def show() -> None:

@@ -21,7 +21,7 @@ from ...backend.shared.grouping import grouped, read_groups
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.objects import EDITABLE, SceneObject, edit_objects, read_objects
 from .. import scene
-from ..blender import messages, writing
+from ..blender import messages, undo, writing
 from ..environment import known_folders
 from ..picking import selection
 from ..scene import from_stored, to_stored
@@ -98,11 +98,7 @@ def store(root: bpy.types.Collection, before: object_list.State) -> None:
     gone = (entries.keys() & before.rows.keys()) - rows.keys()
     changes: dict[int, dict] = {object_id: dict.fromkeys(EDITABLE) for object_id in gone}
     for object_id, row in rows.items():
-        there = entries.get(object_id, SceneObject(object_id, "", (0, 0, 0), 0))
-        stored = {name: getattr(there, name) or None for name in row} | {
-            "color": list(there.color), "merged_into": there.merged_into,
-            "recolor": object_list.rounded(there.recolor).stored(),
-        }  # fmt: skip
+        stored = object_list.row_of(entries.get(object_id, SceneObject(object_id, "", (0, 0, 0), 0)))
         was = before.rows.get(object_id)
         changed = {
             key: value for key, value in row.items() if value != stored[key] and (was is None or value != was[key])
@@ -120,7 +116,8 @@ def store_edits(root: bpy.types.Collection) -> None:
     """Write pending edits to objects.json before it is read elsewhere, if the folder is accepted."""
     flush()
     if folder_trust.is_accepted(root):
-        scene.store_placements(root)
+        with undo.step_for_links(root, "Duplicates"):
+            scene.store_placements(root)
 
 
 def accept(root: bpy.types.Collection, folder: Path) -> bool:
@@ -272,8 +269,8 @@ def notify(root: bpy.types.Collection) -> None:
         call(root)
 
 
-def flush() -> None:
-    """Write pending colors."""
+def flush(is_shown: bool = True) -> None:
+    """Write pending colors; show them on points and in other scenes unless undo or another file is about to."""
     waiting = dict(_unwritten)
     _unwritten.clear()
     for root in [root for root in bpy.data.collections if waiting and scene.kind_of(root) == "reconstruction"]:
@@ -282,10 +279,10 @@ def flush() -> None:
         marks = ((item, (root.session_uid, from_stored(item.object_id))) for item in root.objectgs.objects)
         items = [(item, waiting[mark]) for item, mark in marks if mark in waiting]
         if items:
-            _write_colors(root, items)
+            _write_colors(root, items, is_shown)
 
 
-def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]]) -> None:
+def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]], is_shown: bool) -> None:
     """Write the named colors of rows."""
     values = {"color": object_list.rgb_of, "recolor": lambda item: object_list.recolor_of(item).stored()}
     changes = {from_stored(item.object_id): {name: values[name](item) for name in names} for item, names in items}
@@ -300,8 +297,9 @@ def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]])
         return
     for item, _ in items:
         _remember(item, colors_only=True)
-    if any("color" in names for _, names in items):
-        _show_written(root)
+    if is_shown and any("color" in names for _, names in items):
+        with undo.step_for_links(root, "Colors"):
+            _show_written(root)
 
 
 def _show_label(item: Any) -> None:

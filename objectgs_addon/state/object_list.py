@@ -9,7 +9,7 @@ import bpy
 
 from ...backend.shared.color.recolor import Recolor
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.objects import follow_merges
+from ...backend.shared.reconstruction.objects import SceneObject, follow_merges
 from .. import scene
 from ..picking import selection
 from ..scene import from_stored
@@ -117,6 +117,22 @@ def rounded(recolor: Recolor | None) -> Recolor:
 def rgb_of(item: Any) -> list[int]:
     """Return the color of a row, sRGB 0 .. 255."""
     return [round(255 * channel) for channel in item.color]
+
+
+def row_of(entry: SceneObject) -> dict[str, Any]:
+    """Return the row of an object of objects.json as `state_of` returns those of the list."""
+    return {
+        "name": entry.name,
+        "color": list(entry.color),
+        "left_out": entry.left_out or None,
+        "merged_into": entry.merged_into,
+        "removed": entry.removed or None,
+        "floaters": entry.floaters or None,
+        "fill": entry.fill or None,
+        "cleaned": entry.cleaned or None,
+        "recolor": rounded(entry.recolor).stored(),
+        "separated": entry.separated or None,
+    }
 
 
 class State(NamedTuple):

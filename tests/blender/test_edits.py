@@ -21,7 +21,7 @@ from objectgs.backend.shared.reconstruction.objects import edit_objects, read_ob
 from objectgs.backend.shared.splats.spherical_harmonics import C0
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.blender import older_files
+from objectgs.objectgs_addon.blender import older_files, undo
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.panels.edits import EditPanel
 from objectgs.objectgs_addon.picking import selection
@@ -666,6 +666,90 @@ def test_undo_and_redo_restore_all_edits(root, tmp_path):
     wanted = state(active())
     show_again(active())
     assert state(active()) == wanted, "the folder matches Blender's state"
+
+
+@pytest.fixture
+def steps(monkeypatch) -> list[str]:
+    """Titles of the undo steps that the extension pushes, as in a window."""
+    titles = []
+
+    def push(title):
+        titles.append(title)
+        bpy.ops.ed.undo_push(message=title)
+
+    bpy.context.preferences.edit.use_global_undo = True
+    monkeypatch.setattr(undo, "push", push)
+    return titles
+
+
+def duplicate_in_blender() -> None:
+    """Duplicate object 1 by Blender's own operator and move the duplicate, each with its undo step."""
+    selection.select_object(bpy.context, active(), 1)
+    bpy.ops.ed.undo_push(message="selected")
+    bpy.ops.object.duplicate()
+    twin = next(obj for obj in bpy.context.selected_objects if blender_scene.kind_of(obj) == "object_parent")
+    twin.location.x += 2.0
+    bpy.ops.ed.undo_push(message="duplicated")
+
+
+def links() -> dict:
+    """Return what is linked in which collection; pointers to data-blocks that undo has freed would crash here."""
+    return {
+        each.name: (sorted(child.name for child in each.children), sorted(obj.name for obj in each.objects))
+        for each in (active(), *active().children_recursive)
+    }
+
+
+def test_undo_leaves_what_blender_duplicated_where_it_is(root, steps):
+    """A collection that undo makes is in none of its steps, so that the next undo would free it alone."""
+    bpy.ops.ed.undo_push(message="begin")
+    before = links()
+    duplicate_in_blender()
+    duplicated = links()
+    active().children[0].hide_render = True
+    bpy.ops.ed.undo_push(message="hidden")
+    bpy.ops.ed.undo()
+    assert links() == duplicated and not blender_scene.duplicates_of(active()) and entry(active()).copies == ()
+    bpy.ops.ed.undo()
+    assert links() == before and steps == []
+    bpy.ops.ed.redo()
+    assert links() == duplicated
+    object_edits.store_edits(active())
+    assert len(blender_scene.duplicates_of(active())[1]) == len(entry(active()).copies) == 1
+
+
+def test_stored_duplicates_of_blender_have_an_undo_step(root, steps, tmp_path):
+    bpy.ops.ed.undo_push(message="begin")
+    duplicate_in_blender()
+    duplicated = links()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
+    stored, copies = links(), entry(active()).copies
+    assert steps == ["Duplicates"] and stored != duplicated and len(copies) == 1
+    bpy.ops.wm.save_mainfile()
+    assert steps == ["Duplicates"], "there is nothing new to store"
+    bpy.ops.ed.undo()
+    assert links() == duplicated and entry(active()).copies == ()
+    bpy.ops.ed.redo()
+    assert links() == stored and entry(active()).copies == copies
+    for obj in list(blender_scene.duplicates_of(active())[1][0].objects):
+        bpy.data.objects.remove(obj)
+    bpy.ops.ed.undo_push(message="deleted")
+    bpy.ops.wm.save_mainfile()
+    assert entry(active()).copies == () and not blender_scene.duplicates_of(active())
+    bpy.ops.ed.undo()
+    bpy.ops.ed.undo()
+    assert links() == stored and entry(active()).copies == copies
+    bpy.ops.ed.redo()
+    assert entry(active()).copies == (), "what undo shows without its pivot is no duplicate"
+
+
+def test_written_colors_have_an_undo_step_only_with_new_duplicates(root, steps):
+    bpy.ops.ed.undo_push(message="begin")
+    item(active()).color = (1.0, 0.0, 0.0)
+    assert steps == []
+    duplicate_in_blender()
+    item(active()).color = (0.0, 1.0, 0.0)
+    assert steps == ["Colors"] and len(blender_scene.duplicates_of(active())[1]) == 1
 
 
 def test_edits_survive_merge_and_split(root):

@@ -90,7 +90,7 @@ Places = tuple[list | None, list]
 
 def places_of(root: bpy.types.Collection) -> dict[int, Places]:
     """Return where the objects of a reconstruction are now, by ID."""
-    copies = duplicates_of(root)
+    copies = _whole_duplicates(root)
     return {
         object_id: (_place(root, collection), [_place(root, copy) or _IDENTITY for copy in copies.get(object_id, ())])
         for object_id, collection in object_collections(root).items()
@@ -98,15 +98,24 @@ def places_of(root: bpy.types.Collection) -> dict[int, Places]:
     }
 
 
+def _whole_duplicates(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
+    """Return the duplicates of each object whose pivots the user has not deleted."""
+    return {
+        object_id: [copy for copy in copies if part_of(copy, OBJECT_PARENT) is not None]
+        for object_id, copies in duplicates_of(root).items()
+    }
+
+
 def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | None = None) -> None:
     """Write placements and duplicates that the user changed to objects.json.
 
-    Copies made with Blender's own operators are converted to duplicates.
+    Copies made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step.
 
     Args:
         root: the reconstruction's collection.
         before: after an undo, where objects were before it; those that it has moved are compared with the file, as it
-            has also undone what they remember of the file.
+            has also undone what they remember of the file. No duplicates are then converted or removed, since undo
+            could free their data-blocks while others refer to them.
 
     Raises:
         InputError: objects.json cannot be used.
@@ -115,12 +124,13 @@ def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | 
     path = Reconstruction(folder_of(root)).objects
     if not path.exists():
         return
-    adopt_blender_duplicates(root)
-    for twins in duplicates_of(root).values():
-        for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
-            remove_duplicate(copy)  # The user deleted its pivot.
-    bring_up_to_date(root)
-    copies, collections = duplicates_of(root), object_collections(root)
+    if before is None and bpy.context.mode == "OBJECT":
+        adopt_blender_duplicates(root)
+        for twins in duplicates_of(root).values():
+            for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
+                remove_duplicate(copy)  # The user deleted its pivot.
+        bring_up_to_date(root)
+    copies, collections = _whole_duplicates(root), object_collections(root)
     now = places_of(root)
     # What is scaled to nothing, as at the beginning of an animation, keeps its place in the file.
     now = {object_id: places for object_id, places in now.items() if not _is_flat(places)}
