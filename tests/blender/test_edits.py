@@ -592,6 +592,25 @@ def test_blender_duplicates_become_stored_duplicates(root):
     assert place == pytest.approx(independent(root, part(root, "splats", 2)) + np.array([0, 1, 0]), abs=1e-4)
 
 
+def test_an_older_blend_can_show_what_another_moved(root, folder, tmp_path):
+    """Saving a move of one object does not hide those of others that another .blend or program has stored."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "older.blend"))
+    part(root, "object_parent", 2).location.x += 1.0
+    activate(root, 2)
+    bpy.ops.objectgs.duplicate_object()
+    stored = entry(root, 2)
+    assert stored.transform is not None and stored.copies
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "older.blend"))
+    part(active(), "object_parent").location.y += 1.0
+    bpy.ops.wm.save_mainfile()
+    assert entry(active()).transform is not None and entry(active(), 2) == stored
+    show_again(active())
+    moved = blender_scene.placement_of(active(), collection_of(active(), 2))
+    assert moved == pytest.approx(np.array(stored.transform), abs=1e-4)
+    assert len(blender_scene.duplicates_of(active())[2]) == 1
+    assert entry(active()).transform is not None and entry(active(), 2) == stored
+
+
 # Undo.
 
 

@@ -161,6 +161,10 @@ def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | 
         place, copied = now[object_id]
         change = changes.get(object_id, {})
         entry = entries[object_id]
+        if object_id not in changed and not (
+            _same(root, [entry.transform], [place]) and _same(root, entry.copies, copied)
+        ):
+            continue  # Another file or program has moved it, which Reload Result is to show.
         _agree(root, collections[object_id], change["transform"] if "transform" in change else _rows(entry.transform))
         stored = change["copies"] or [] if "copies" in change else [_rows(copy) for copy in entry.copies]
         for copy, matrix in zip(copies.get(object_id, ()), stored):
