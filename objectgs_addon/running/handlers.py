@@ -11,10 +11,14 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.reconstruction.folder import Reconstruction
 from .. import scene
 from ..blender import messages, writing
 from ..state import folder_trust, object_edits, object_list, splat_edits
 from . import background, pointing, results
+
+_RELOAD = "objectgs.show_result"
+"""Operator that shows the newer edits in a folder."""
 
 _before: dict[int, object_list.State] = {}
 """Session UID of a reconstruction -> its state before the undo or redo that is going on."""
@@ -78,19 +82,32 @@ def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collect
 def _file_loaded(*_: Any) -> None:
     """Set the active reconstruction and fill lists of objects, which files built without a window lack.
 
-    The lists are filled only from accepted folders, and no other folder is read.
+    The lists are filled only from accepted folders, and no other folder is read. A message tells if the .blend is older
+    than the edits of objects in its folder, which exports use.
     """
     splat_edits.forget()
+    messages.settle("", _RELOAD)
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
         roots = [root for root in roots if not scene.is_linked(root)]
-        for root in roots:
-            if not root.objectgs.objects and folder_trust.is_accepted(root):
-                # The panel already reports a missing or invalid folder.
-                with contextlib.suppress(InputError, OSError):
-                    object_edits.fill(root)
         if roots and owner.objectgs.active is None:
             owner.objectgs.active = roots[0]
+        for root in filter(folder_trust.is_accepted, roots):
+            # The panel already reports a missing or invalid folder.
+            with contextlib.suppress(InputError, OSError):
+                if not root.objectgs.objects:
+                    object_edits.fill(root)
+                elif not object_list.shows_edits(root):
+                    _tell_newer_edits(root)
+
+
+def _tell_newer_edits(root: bpy.types.Collection) -> None:
+    path = Reconstruction(scene.folder_of(root)).objects
+    text = f"{root.name} does not show the edits in {path}, which exports use; use Reload Result to show them."
+    if root == bpy.context.scene.objectgs.active:
+        messages.show(text, operator=_RELOAD, label="Reload Result")
+    else:
+        messages.show(text)
 
 
 def register() -> None:

@@ -10,7 +10,16 @@ from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_
 from .edits.floaters import floater_counts, floating_splats, hidden_splats, update_floaters
 from .edits.placement import distance_moved, is_moved, matrix_to_capture, matrix_to_world, placement_of
 from .edits.recolor import luma_of, recolor_of, with_own_textures
-from .edits.show import Places, is_removed, places_of, recolor, reset_placement, show_edits, store_placements
+from .edits.show import (
+    Places,
+    is_removed,
+    places_of,
+    recolor,
+    reset_placement,
+    show_edits,
+    shows_places,
+    store_placements,
+)
 from .edits.single_splats import (
     ShownEdits,
     delete_splats,
@@ -135,6 +144,7 @@ __all__ = [
     "shown_edits",
     "shown_kinds",
     "shown_points",
+    "shows_places",
     "splat_keys",
     "store_placements",
     "to_stored",

@@ -49,19 +49,22 @@ def without_callbacks() -> Iterator[None]:
         _filling = before
 
 
-def fill(root: bpy.types.Collection) -> None:
-    """Fill the list from objects.json and the shown splats and meshes; it is empty before the first vote."""
+def fill(root: bpy.types.Collection, in_place: bool = False) -> None:
+    """Fill the list from objects.json and what is shown; with `in_place`, which keeps its rows, only if they match."""
     flush()
     properties = root.objectgs
     path = Reconstruction(scene.folder_of(root)).objects
     entries = read_objects(path) if path.exists() else []
     shown, faces = object_list.splat_counts(root), object_list.face_counts(root)
-    active = object_list.active_item(root)
-    active_id = active.object_id if active else None
+    active_id = getattr(object_list.active_item(root), "object_id", None)
     with without_callbacks():
-        properties.objects.clear()
-        for entry in entries:
-            item = properties.objects.add()
+        if [item.object_id for item in properties.objects] != [to_stored(entry.id) for entry in entries]:
+            if in_place:
+                return
+            properties.objects.clear()
+            for _ in entries:
+                properties.objects.add()
+        for index, (item, entry) in enumerate(zip(properties.objects, entries)):
             item.name = entry.name
             item.object_id = to_stored(entry.id)
             item.color = [channel / 255.0 for channel in entry.color]
@@ -72,12 +75,11 @@ def fill(root: bpy.types.Collection) -> None:
             item.is_merged = entry.merged_into is not None
             item.merged_into = to_stored(entry.merged_into or 0)
             item.removed, item.floaters, item.fill = entry.removed, entry.floaters, entry.fill
-            item.cleaned = entry.cleaned
-            item.separated = entry.separated
+            item.cleaned, item.separated = entry.cleaned, entry.separated
             _set_sliders(item, entry.recolor)
             _remember(item)
             if item.object_id == active_id:
-                properties.active_object = len(properties.objects) - 1
+                properties.active_object = index
         properties.active_object = max(0, min(properties.active_object, len(entries) - 1))
 
 
@@ -170,10 +172,9 @@ def merge(root: bpy.types.Collection, object_ids: Iterable[int], into: int) -> N
 
 def split(root: bpy.types.Collection, object_id: int) -> int:
     """Undo every merge into `object_id` and its own merge, and return their number."""
-    items = root.objectgs.objects
     apart = [
         from_stored(item.object_id)
-        for item in items
+        for item in root.objectgs.objects
         if item.is_merged and (from_stored(item.merged_into) == object_id or from_stored(item.object_id) == object_id)
     ]
     _edit(root, {part: {"merged_into": None} for part in apart})
@@ -396,6 +397,7 @@ def _show_written(root: bpy.types.Collection) -> None:
     try:
         if object_list.scenes_of(root):
             scene.show_objects(root, scene.folder_of(root))
+            fill(root, in_place=True)  # An update callback must not remove its row.
         notify(root)
     except (InputError, OSError) as error:
         messages.show(messages.sentence(error), "ERROR")

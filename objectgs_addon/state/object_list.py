@@ -9,7 +9,8 @@ import bpy
 
 from ...backend.shared.color.recolor import Recolor
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.objects import SceneObject, follow_merges
+from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.objects import SceneObject, follow_merges, read_objects
 from .. import scene
 from ..picking import selection
 from ..scene import from_stored
@@ -144,7 +145,22 @@ class State(NamedTuple):
 
 def state_of(root: bpy.types.Collection) -> State:
     """Return the present list and places, to be compared with those after an undo."""
-    rows = {
+    return State(_rows_of(root), scene.places_of(root))
+
+
+def shows_edits(root: bpy.types.Collection) -> bool:
+    """Return whether the list, the places and the duplicates are those that objects.json had at the last sync.
+
+    Raises:
+        InputError: objects.json cannot be used.
+    """
+    path = Reconstruction(scene.folder_of(root)).objects
+    entries = read_objects(path) if path.exists() else []
+    return _rows_of(root) == {entry.id: row_of(entry) for entry in entries} and scene.shows_places(root, entries)
+
+
+def _rows_of(root: bpy.types.Collection) -> dict[int, dict[str, Any]]:
+    return {
         from_stored(item.object_id): {
             "name": item.name,
             "color": rgb_of(item),
@@ -159,4 +175,3 @@ def state_of(root: bpy.types.Collection) -> State:
         }
         for item in root.objectgs.objects
     }
-    return State(rows, scene.places_of(root))

@@ -21,7 +21,7 @@ from objectgs.backend.shared.reconstruction.objects import edit_objects, read_ob
 from objectgs.backend.shared.splats.spherical_harmonics import C0
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
-from objectgs.objectgs_addon.blender import older_files, undo
+from objectgs.objectgs_addon.blender import messages, older_files, undo
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.panels.edits import EditPanel
 from objectgs.objectgs_addon.picking import selection
@@ -609,6 +609,54 @@ def test_an_older_blend_can_show_what_another_moved(root, folder, tmp_path):
     assert moved == pytest.approx(np.array(stored.transform), abs=1e-4)
     assert len(blender_scene.duplicates_of(active())[2]) == 1
     assert entry(active()).transform is not None and entry(active(), 2) == stored
+
+
+@pytest.fixture
+def told(monkeypatch) -> list:
+    """What messages were shown, as (text, operator)."""
+    texts = []
+    monkeypatch.setattr(messages, "show", lambda text, kind="INFO", operator=None, **_: texts.append((text, operator)))
+    return texts
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"removed": True},
+        {"recolor": RECOLOR.stored()},
+        {"merged_into": 2},
+        {"transform": np.diag([1.0, 2.0, 1.0, 1.0]).tolist()},
+        {"copies": [np.eye(4).tolist()]},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_opening_an_older_blend_tells_of_newer_edits(root, folder, tmp_path, told, change):
+    """Exports use the folder's edits, which the .blend does not show."""
+    set_sliders(root, object_id=2)
+    activate(root, 2)
+    bpy.ops.objectgs.duplicate_object()
+    part(root, "object_parent", HUGE).location.x += 1.0
+    path = str(tmp_path / "some.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert told == [], "the .blend shows the folder's edits"
+    edit_objects(folder / "objects.json", {1: change})
+    bpy.ops.wm.open_mainfile(filepath=path)
+    ((text, operator),) = told
+    assert "Reload Result" in text and operator == "objectgs.show_result"
+    show_again(active())
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert len(told) == 1
+
+
+def test_edits_of_rows_show_in_the_list_what_another_program_wrote(root, folder):
+    edit_objects(folder / "objects.json", {1: {"removed": True}})
+    item(root, 2).name = "crate"
+    assert collection_of(root).hide_render and item(root).removed and item(root, 2).name == "crate"
+    activate(root, 1)
+    assert bpy.ops.objectgs.restore_object() == {"FINISHED"}
+    assert not entry(root).removed and not collection_of(root).hide_render
 
 
 # Undo.

@@ -8,7 +8,7 @@ therefore stores the values of objects.json and the placement of its parts at th
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import bpy
@@ -96,6 +96,17 @@ def places_of(root: bpy.types.Collection) -> dict[int, Places]:
         for object_id, collection in object_collections(root).items()
         if local_placement(root, collection) is not None
     }
+
+
+def shows_places(root: bpy.types.Collection, entries: Iterable[SceneObject]) -> bool:
+    """Return whether objects of objects.json have the placements and duplicates that they had at the last sync."""
+    collections = object_collections(root)
+    return all(
+        _rows(entry.transform) == _agreed_place(collections[entry.id])
+        and [_rows(copy) for copy in entry.copies] == _agreed_copies(collections[entry.id])
+        for entry in entries
+        if entry.id in collections
+    )
 
 
 def _whole_duplicates(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
