@@ -10,7 +10,7 @@ import bpy
 from .. import scene
 from ..blender import writing
 from ..picking.selection import selectable
-from . import object_edits
+from . import object_edits, object_list
 
 _owner = object()
 
@@ -27,11 +27,14 @@ def _active_changed() -> None:
     if root is None or scene.is_linked(root):
         return
     context.scene.objectgs.active = root
-    for index, item in enumerate(root.objectgs.objects):
-        if scene.from_stored(item.object_id) == object_id:
-            with object_edits.without_callbacks():
-                root.objectgs.active_object = index
-            break
+    shown = object_list.shown_item(root)
+    # A row that is merged into this object stays active: a click on it has selected the object.
+    if shown is None or scene.from_stored(shown.object_id) != object_id:
+        for index, item in enumerate(root.objectgs.objects):
+            if scene.from_stored(item.object_id) == object_id:
+                with object_edits.without_callbacks():
+                    root.objectgs.active_object = index
+                break
     if context.scene.objectgs.select_whole:
         whole = scene.collection_of(part)
         for other in scene.parts_of(whole) if whole is not None else ():

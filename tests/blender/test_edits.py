@@ -32,7 +32,7 @@ from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
-from objectgs.objectgs_addon.state import object_edits, object_list, visibility
+from objectgs.objectgs_addon.state import click_selection, object_edits, object_list, visibility
 
 import headless
 
@@ -827,6 +827,20 @@ def test_edits_survive_merge_and_split(root):
     assert object_edits.split(root, 2) == 1
     assert blender_scene.placement_of(root, collection_of(root))[0, 3] == pytest.approx(1.0, abs=1e-4)
     assert blender_scene.recolor_of(collection_of(root)).hue == 0.1
+
+
+def test_rows_of_merged_objects_stay_active_when_clicked(root):
+    """The click on a row selects the object that it is merged into, which Blender then announces as a click on that."""
+    object_edits.merge(root, [1, HUGE], 2)
+    activate(root, 1)
+    assert selection.selected_ids(bpy.context, root) == [2]
+    click_selection._active_changed()
+    assert object_list.active_item(root) == item(root, 1)
+    assert bpy.ops.objectgs.split_objects() == {"FINISHED"}
+    assert entry(root).merged_into is None and entry(root, HUGE).merged_into == 2
+    selection.select_object(bpy.context, root, 2)
+    click_selection._active_changed()
+    assert object_list.active_item(root) == item(root, 2)
 
 
 def test_failed_write_reverts_color(root, folder):
