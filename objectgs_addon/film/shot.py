@@ -267,7 +267,9 @@ def _instance_of(obj: bpy.types.Object, paths: Any, whole: tuple, instancer: Any
     object_id = object_id_of(obj)
     if pivot is None or object_id is None:
         return None
-    meshes = [part for part in pivot.children if kind_of(part) == MESH]
+    # The user may have given a mesh another parent, or moved it to another collection.
+    apart = [part for each in collections for part in each.objects if kind_of(part.parent) != OBJECT_PARENT]
+    meshes = [part for part in {*pivot.children, *apart} if kind_of(part) == MESH and object_id_of(part) == object_id]
     if object_id == 0:
         meshes += whole
     top = instancer or obj

@@ -8,18 +8,16 @@ from .edits.crop_box import add_crop_box, box_of, crop_box_of
 from .edits.duplicates import duplicate, remove_duplicate
 from .edits.fills import UNOBSERVED_COUNT, missing_fill, show_fills, unobserved_splats
 from .edits.floaters import floater_counts, floating_splats, hidden_splats, update_floaters
-from .edits.placement import distance_moved, is_moved, matrix_to_capture, matrix_to_world, placement_of
-from .edits.recolor import luma_of, recolor_of, with_own_textures
-from .edits.show import (
-    Places,
-    is_removed,
-    places_of,
-    recolor,
+from .edits.placement import (
+    distance_moved,
+    is_moved,
+    matrix_to_capture,
+    matrix_to_world,
+    placement_of,
     reset_placement,
-    show_edits,
-    shows_places,
-    store_placements,
 )
+from .edits.recolor import luma_of, recolor_of, with_own_textures
+from .edits.show import Places, is_removed, places_of, recolor, show_edits, shows_places, store_placements
 from .edits.single_splats import (
     ShownEdits,
     delete_splats,

@@ -24,6 +24,12 @@ _FIELDS = {
 KINDS = frozenset(_FIELDS)
 """Attribute types that can be read and written."""
 
+SAMPLES = "objectgs_samples"
+"""Custom property of a mesh: its number of vertices and the positions of some when it was filled."""
+
+EXACT = 1e-5
+"""Largest distance of a vertex from an affine map of it, relative to the coordinates."""
+
 
 def require_object_mode(objs: Iterable[bpy.types.Object]) -> None:
     """Raise InputError if any of the objects is in Edit Mode or another mode that edits its mesh.
@@ -51,6 +57,45 @@ def fill(mesh: bpy.types.Mesh, positions: np.ndarray, attributes: dict[str, tupl
     for name, (kind, values) in attributes.items():
         write(mesh, name, kind, values)
     mesh.update()
+    remember_positions(mesh)
+
+
+def remember_positions(mesh: bpy.types.Mesh) -> None:
+    """Store the positions of some vertices of a newly filled mesh, with which `applied_map` compares later ones."""
+    mesh[SAMPLES] = _sampled(mesh)
+
+
+def applied_map(mesh: bpy.types.ID) -> np.ndarray:
+    """Return the map that Blender's operators have applied to all vertices since the mesh was filled, (4, 4) float64.
+
+    *Apply* and *Set Origin* change vertices and transform at once, so that the mesh stays where it is. The map is
+    exactly the identity without them, or after edits of the shape.
+    """
+    found = np.eye(4)
+    if not isinstance(mesh, bpy.types.Mesh):
+        return found  # The user has converted it.
+    stored, current = getattr(mesh.get(SAMPLES), "to_list", list)(), _sampled(mesh)
+    if stored == current or len(stored) != len(current) or stored[0] != current[0]:
+        return found
+    before, now = (np.array(each[1:]).reshape(-1, 3) for each in (stored, current))
+    tolerance = EXACT * max(np.abs(before).max(), np.abs(now).max())
+    shift = (now - before).mean(0)
+    if np.abs(before + shift - now).max() <= tolerance:
+        found[:3, 3] = shift
+        return found
+    local = np.column_stack([before, np.ones(len(before))])
+    fit, _, rank, _ = np.linalg.lstsq(local, now, rcond=None)
+    # Any change of 4 vertices is an affine map.
+    if len(before) > 4 and rank == 4 and np.abs(local @ fit - now).max() <= tolerance and np.linalg.det(fit[:3]):
+        found[:3] = fit.T
+    return found
+
+
+def _sampled(mesh: bpy.types.Mesh) -> list[float]:
+    """Return the number of vertices of a mesh, and the coordinates of up to 12 spread over it."""
+    vertices, count = mesh.vertices, len(mesh.vertices)
+    chosen = sorted({index * (count - 1) // 11 for index in range(12)}) if count else ()
+    return [float(count), *(value for index in chosen for value in vertices[index].co)]
 
 
 def write(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:

@@ -175,7 +175,7 @@ def _moved_out(
     known = set(inside)
     others = [each for each in bpy.data.collections if kind_of(each) == kind and each not in known]
     pivots = ((each, part_of(each, OBJECT_PARENT)) for each in others)
-    return [each for each, pivot in pivots if pivot is not None and pivot.parent == parent]
+    return [each for each, pivot in pivots if pivot is not None and parent_above(pivot) == parent]
 
 
 def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:
@@ -183,6 +183,14 @@ def collection_of(part: bpy.types.Object) -> bpy.types.Collection | None:
     return next(
         (collection for collection in part.users_collection if kind_of(collection) in (OBJECT, DUPLICATE)), None
     )
+
+
+def parent_above(obj: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the parent empty of the reconstruction that a Blender object is parented to, also through others."""
+    above = obj
+    while above is not None and kind_of(above) != PARENT:
+        above = above.parent
+    return above
 
 
 def root_of(block: bpy.types.ID, scene: bpy.types.Scene) -> bpy.types.Collection | None:
@@ -195,9 +203,7 @@ def root_of(block: bpy.types.ID, scene: bpy.types.Scene) -> bpy.types.Collection
         block = part_of(block, OBJECT_PARENT)
     if not isinstance(block, bpy.types.Object):
         return None
-    above = block
-    while above is not None and kind_of(above) != PARENT:
-        above = above.parent
+    above = parent_above(block)
     for root in roots:
         if above is not None and parent_of(root) == above:
             return root

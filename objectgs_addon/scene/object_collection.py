@@ -39,7 +39,11 @@ def new_collection(object_id: int, objects: Objects) -> bpy.types.Collection:
 def ensure_pivot(
     collection: bpy.types.Collection, parent: bpy.types.Object | None, object_id: int, positions: np.ndarray
 ) -> bpy.types.Object:
-    """Return the object's pivot (its own parent empty), created at the median of `positions` (n, 3) if missing."""
+    """Return the object's pivot (its own parent empty), created at the median of `positions` (n, 3) if missing.
+
+    A new one becomes the parent of parts whose pivot the user deleted. Others without a parent are left as they are,
+    since the user has cleared it.
+    """
     pivot = part_of(collection, OBJECT_PARENT)
     if pivot is None:
         pivot = bpy.data.objects.new(collection[NAME], None)
@@ -53,9 +57,10 @@ def ensure_pivot(
         pivot[CENTER] = center.tolist()
         pivot.location = center
         pivot.parent = parent
+        for part in parts_of(collection):
+            if part.parent is None:
+                part.parent = pivot
         collection.objects.link(pivot)
-    elif pivot.parent is None:
-        pivot.parent = parent
     return pivot
 
 

@@ -20,6 +20,7 @@ from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of, put_capture_last
 from .edits.floaters import mark_distant, mark_floaters
+from .edits.recover import recover_parts
 from .edits.show import show_edits
 from .edits.single_splats import (
     captured_positions,
@@ -104,6 +105,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     anchors, more = read_anchors(folder)
     objects = Objects.read(folder)
     edits = read_splat_edits(Reconstruction(folder))
+    recover_parts(root)
     collections = object_collections(root)
     is_first = not collections
     carrier.require_object_mode(part for collection in collections.values() for part in parts_of(collection))
@@ -265,8 +267,6 @@ class _Makers:
         """Return the carrier of a kind in `collection`, created if missing."""
         obj = part_of(collection, kind)
         if obj is not None:
-            if obj.parent is None:
-                obj.parent = pivot  # The user deleted the previous pivot.
             return obj
         name = f"{collection[NAME]} {kind}"
         mesh = bpy.data.meshes.new(name)

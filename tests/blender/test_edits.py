@@ -659,6 +659,158 @@ def test_edits_of_rows_show_in_the_list_what_another_program_wrote(root, folder)
     assert not entry(root).removed and not collection_of(root).hide_render
 
 
+# Blender's own operators.
+
+
+@pytest.fixture
+def parts_shown(root) -> list:
+    """The pivot, the splats and the mesh of object 1, all visible."""
+    blender_scene.show_kinds(root, "both")
+    return [part(root, kind) for kind in ("object_parent", "splats", "mesh")]
+
+
+def choose(*objs) -> None:
+    bpy.ops.object.select_all(action="DESELECT")
+    for obj in objs:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = objs[0]
+    bpy.context.view_layer.update()
+
+
+def seen(parts) -> list[np.ndarray]:
+    """Return the world coordinates (n, 3) of the vertices of parts other than pivots."""
+    found = []
+    for obj in parts[1:]:
+        matrix = placement.matrix_to_world(obj)
+        found.append(carrier.read(obj.data, "position") @ matrix[:3, :3].T + matrix[:3, 3])
+    return found
+
+
+def stay(parts, before) -> bool:
+    return all(np.allclose(now, then, atol=1e-4) for now, then in zip(seen(parts), before))
+
+
+def mesh_again(root, folder) -> None:
+    """Show the same mesh of object 1 from newer files."""
+    for path in (folder / "meshes").iterdir():
+        os.utime(path, ns=(path.stat().st_mtime_ns + 5_000_000_000,) * 2)
+    show_again(root)
+
+
+def test_set_origin_is_not_a_move(root, folder, parts_shown):
+    before, positions = seen(parts_shown), carrier.read(parts_shown[1].data, "position")
+    choose(*parts_shown)
+    bpy.ops.object.origin_set(type="ORIGIN_GEOMETRY")
+    assert all(obj.location.length > 0.05 for obj in parts_shown[1:])
+    blender_scene.store_placements(root)
+    assert entry(root).transform is None and stay(parts_shown, before)
+    assert carrier.read(parts_shown[1].data, "position") == pytest.approx(positions, abs=1e-6)
+    assert parts_shown[2].location.length > 0.05, "a mesh keeps its origin"
+    mesh_again(root, folder)
+    blender_scene.store_placements(root)
+    assert entry(root).transform is None and stay(parts_shown, before)
+    choose(parts_shown[2])
+    bpy.ops.object.origin_set(type="ORIGIN_GEOMETRY")
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert stay(parts_shown, before)
+
+
+def test_applied_transforms_are_kept(root, folder, parts_shown):
+    """Applying changes the positions of splats, but not their scale and rotation."""
+    mesh = tetrahedron(ORIGIN + 0.5)
+    for name in ("vertices", "normals", "colors"):
+        setattr(mesh, name, np.tile(getattr(mesh, name), (2, 1)))
+    write_meshes(folder, {"1": mesh})
+    mesh_again(root, folder)
+    positions = carrier.read(parts_shown[1].data, "position")
+    parts_shown[0].scale = 2.0, 2.0, 2.0
+    parts_shown[0].rotation_euler.z = 0.5
+    parts_shown[0].location.x += 1.0
+    before, place = seen(parts_shown), blender_scene.placement_of(root, collection_of(root))
+    for properties in ({"location": False, "rotation": False}, {}):
+        choose(*parts_shown)
+        bpy.ops.object.transform_apply(**properties)
+        assert np.abs(carrier.read(parts_shown[1].data, "position") - positions).max() > 1.0
+        blender_scene.store_placements(root)
+        assert np.array(entry(root).transform) == pytest.approx(place, abs=1e-3)
+        assert carrier.read(parts_shown[1].data, "position") == pytest.approx(positions, abs=1e-5)
+        assert stay(parts_shown, before)
+    mesh_again(root, folder)
+    assert stay(parts_shown, before)
+
+
+def test_cleared_parents_stay_cleared(root, folder, parts_shown):
+    parts_shown[0].location.x += 1.0
+    parts_shown[2].data.vertices[1].co.x += 5.0
+    before, place = seen(parts_shown), blender_scene.placement_of(root, collection_of(root))
+    choose(*parts_shown)
+    bpy.ops.object.parent_clear(type="CLEAR_KEEP_TRANSFORM")
+    show_again(root)
+    blender_scene.store_placements(root)
+    assert not any(obj.parent for obj in parts_shown) and stay(parts_shown, before)
+    assert np.array(entry(root).transform) == pytest.approx(place, abs=1e-3)
+    wanted = np.eye(4)
+    wanted[:3, 3] = 0.0, 0.0, 2.0
+    placement.set_placement(root, collection_of(root), wanted)
+    back = independent(root, parts_shown[1]) - (0.0, 0.0, 2.0)
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert entry(root).transform is None
+    assert independent(root, parts_shown[1]) == pytest.approx(back, abs=1e-4)
+    edit_objects(folder / "objects.json", {1: {"merged_into": 2}})
+    show_again(root)
+    assert parts_shown[2].parent == part(root, "object_parent", 2)
+    assert np.array_equal(parts_shown[2].matrix_basis, np.eye(4))
+
+
+def test_objects_moved_to_other_collections_take_their_own_along(root, parts_shown):
+    owner, own, count = bpy.context.scene, collection_of(root), len(bpy.data.objects)
+    places = [bpy.data.collections.new(name) for name in ("Props", "More")]
+    for place in places:
+        owner.collection.children.link(place)
+    for target in (*places, owner.collection, collection_of(root, 2), root):
+        choose(*parts_shown)
+        bpy.ops.object.move_to_collection(collection_uid=target.session_uid)
+        parts_shown[0].location.x += 1.0
+        before = entry(root).transform
+        blender_scene.store_placements(root)
+        assert entry(root).transform != before
+        show_again(root)
+        assert collection_of(root) == own and len(bpy.data.objects) == count
+        assert all(obj.users_collection == (own,) and obj.select_get() for obj in parts_shown)
+        wanted = owner.collection if target == collection_of(root, 2) else target
+        assert [each for each in (*bpy.data.collections, owner.collection) if own in each.children[:]] == [wanted]
+    choose(parts_shown[2])
+    bpy.ops.object.move_to_collection(collection_uid=places[0].session_uid)
+    show_again(root)
+    assert set(parts_shown[2].users_collection) == {own, places[0]} and len(bpy.data.objects) == count
+
+
+def test_objects_parented_to_others_are_placed(root, folder, parts_shown):
+    holder = bpy.data.objects.new("holder", None)
+    bpy.context.scene.collection.objects.link(holder)
+    holder.rotation_euler.x, holder.location.y, holder.parent = 0.5, 2.0, kinds.parent_of(root)
+    before, captured = seen(parts_shown), floaters._places(parts_shown[1])
+    box = np.array(blender_scene.add_crop_box(root, None).matrix_basis)
+    choose(holder, *parts_shown)
+    bpy.ops.object.parent_set(type="OBJECT", keep_transform=True)
+    assert {obj.parent for obj in parts_shown} == {holder}
+    blender_scene.store_placements(root)
+    assert entry(root).transform is None
+    assert np.array_equal(floaters._places(parts_shown[1]), captured)
+    bpy.data.objects.remove(blender_scene.crop_box_of(root))
+    assert np.array(blender_scene.add_crop_box(root, None).matrix_basis) == pytest.approx(box, abs=1e-5)
+    own, count = collection_of(root), len(bpy.data.objects)
+    bpy.context.scene.collection.children.link(own)
+    root.children.unlink(own)
+    holder.location.x += 1.0
+    show_again(root)
+    blender_scene.store_placements(root)
+    assert collection_of(root) == own and len(bpy.data.objects) == count
+    assert np.array(entry(root).transform)[:3, 3] == pytest.approx((1.0, 0.0, 0.0), abs=1e-3)
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert entry(root).transform is None and stay(parts_shown, before)
+
+
 # Undo.
 
 

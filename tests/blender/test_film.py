@@ -273,6 +273,11 @@ def test_objects_below_others_are_filmed(root):
     bpy.context.view_layer.update()
     shot = shoot(root)
     assert_placed(root, shot, shot.frames[0].samples[0], 1, splats_of(root, 1))
+    mesh = bpy.data.objects.new("mesh", bpy.data.meshes.new("mesh"))
+    kinds.mark(mesh, "mesh", 1)
+    blender_scene.object_collections(root)[1].objects.link(mesh)
+    mesh.parent, splats_of(root, 1).hide_render = own, True
+    assert 1 in shoot(root).frames[0].samples[0].objects, "its mesh is seen, and has the same parent as the pivot"
 
 
 def test_duplicates_hidden_in_renders_are_not_filmed(root):

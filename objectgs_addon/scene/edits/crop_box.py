@@ -12,7 +12,7 @@ from ....backend.shared.reconstruction.objects import Matrix as Rows
 from ....backend.shared.reconstruction.objects import affine_map
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import CROP_BOX, SPLATS, mark, object_collections, parent_of, part_of
+from ..kinds import CROP_BOX, OBJECT_PARENT, SPLATS, mark, object_collections, parent_of, part_of
 from ..object_collection import center_of
 from .placement import matrix_to_capture, matrix_to_world
 from .single_splats import deleted_splats, selected_splats
@@ -80,7 +80,8 @@ def _around(root: bpy.types.Collection, to_world: np.ndarray) -> np.ndarray:
         part = part_of(collection, SPLATS)
         if part is not None:
             shown = ~deleted_splats(part.data)
-            center = center_of(part.parent) if part.parent is not None else np.zeros(3)
+            pivot = part_of(collection, OBJECT_PARENT)
+            center = center_of(pivot) if pivot is not None else np.zeros(3)
             places.append(carrier.read(part.data, "position")[shown] + center)
             selected.append(selected_splats(part.data)[shown])
             is_object.append(np.full(int(shown.sum()), object_id != 0))

@@ -14,7 +14,7 @@ from ....backend.shared.reconstruction.objects import SceneObject
 from ....backend.shared.splats.convex_hull import points_inside, reliable_centers
 from ....backend.shared.splats.floaters import distant, floating
 from .. import carrier
-from ..kinds import OBJECT_ID, SPLATS, object_collections, part_of, points_of
+from ..kinds import OBJECT_ID, OBJECT_PARENT, SPLATS, collection_of, object_collections, part_of, points_of
 from ..object_collection import center_of
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import COVERED, DISTANT, FLOATING, HIDDEN
@@ -217,5 +217,7 @@ def _planes(corners: np.ndarray) -> np.ndarray:
 
 def _places(obj: bpy.types.Object) -> np.ndarray:
     """Return the captured positions of a carrier's splats in reconstruction coordinates, (n, 3) float64."""
-    center = center_of(obj.parent) if obj.parent is not None else np.zeros(3)
+    collection = collection_of(obj)
+    pivot = part_of(collection, OBJECT_PARENT) if collection is not None else None
+    center = center_of(pivot) if pivot is not None else np.zeros(3)
     return carrier.read(obj.data, "position").astype(np.float64) + center

@@ -7,8 +7,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from .. import carrier
 from ..capture import origin_of
-from ..kinds import MESH, OBJECT_PARENT, SPLATS, parent_of, part_of
+from ..kinds import ANCHORS, MESH, OBJECT_PARENT, SPLATS, kind_of, parent_of, part_of, parts_of
 from ..object_collection import center_of
 
 PLACEMENT = "objectgs_place"
@@ -16,6 +17,9 @@ PLACEMENT = "objectgs_place"
 
 EXACT = 1e-5
 """Largest relative error of a map as location, rotation and scale; beyond it, the parent inverse stores the rest."""
+
+ROUNDING = 1e-6
+"""Largest difference of two transforms that counts as rounding, relative to their largest number."""
 
 
 def local_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> np.ndarray | None:
@@ -49,25 +53,68 @@ def is_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> bo
 
 
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:
-    """Move an object's pivot so that `placement_of` returns `place`; None restores the captured pose."""
+    """Move an object so that `placement_of` returns `place`; None restores the captured pose.
+
+    This moves the pivot, and parts that the user has given another parent or none.
+    """
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
+    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if _pivot_above(part) is None}
     moved = np.eye(4) if place is None else about(np.asarray(place, np.float64), -origin_of(root))
     wanted = moved @ _shift(_rest(pivot)) @ np.linalg.inv(_own(collection, pivot))
     if pivot.parent is not None:
         wanted = np.linalg.inv(_map(pivot.parent, parent)) @ wanted
     else:
         wanted = _map(parent, None) @ wanted
-    needed = Matrix(wanted.tolist())
-    location, rotation, scale = needed.decompose()
-    simple = Matrix.LocRotScale(location, rotation, scale)
-    size = np.abs(wanted[:3, :3]).max()
-    pivot.matrix_parent_inverse.identity()
-    pivot.matrix_basis = simple
-    if np.abs(np.array(simple) - wanted)[:3, :3].max() > EXACT * size and pivot.parent is not None:
-        # The map contains shear, such as a nonuniform scale after a rotation.
-        pivot.matrix_parent_inverse = needed @ simple.inverted()
+    _place(pivot, wanted)
+    for part, own in apart.items():
+        world = matrix_to_world(pivot) @ own
+        _place(part, world if part.parent is None else np.linalg.inv(matrix_to_world(part.parent)) @ world)
+
+
+def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> None:
+    """Move an object and its individually moved parts back to the captured pose, with the pivot as their parent."""
+    pivot = part_of(collection, OBJECT_PARENT)
+    for part in _own_parts(collection, pivot) if pivot is not None else ():
+        part.parent = pivot
+        _place(part, np.linalg.inv(carrier.applied_map(part.data)))
+    set_placement(root, collection, None)
+
+
+def attach(part: bpy.types.Object, pivot: bpy.types.Object | None) -> None:
+    """Give a part another pivot, and keep how the user has moved it relative to the previous one."""
+    if kind_of(part.parent) != OBJECT_PARENT:
+        _place(part, np.eye(4))
+    part.parent = pivot
+
+
+def move_to_transforms(mesh: bpy.types.Mesh) -> None:
+    """Give what Blender's operators have applied to a mesh back to the transforms of its objects.
+
+    The caller restores the vertices.
+    """
+    applied = carrier.applied_map(mesh)
+    if np.array_equal(applied, np.eye(4)):
+        return
+    for obj in [obj for obj in bpy.data.objects if obj.data == mesh]:
+        _place(obj, _map(obj, obj.parent) @ applied)
+
+
+def take_back(mesh: bpy.types.Mesh) -> None:
+    """Undo what Blender's operators have applied to the vertices of splats; their scale and rotation have not changed.
+
+    Splats in Edit Mode and those of other .blend files are left as they are.
+    """
+    applied = carrier.applied_map(mesh)
+    if np.array_equal(applied, np.eye(4)) or mesh.is_editmode or mesh.library is not None:
+        return
+    move_to_transforms(mesh)
+    back = np.linalg.inv(applied)
+    positions = carrier.read(mesh, "position").astype(np.float64) @ back[:3, :3].T + back[:3, 3]
+    carrier.write(mesh, "position", "FLOAT_VECTOR", positions)
+    mesh.update()
+    carrier.remember_positions(mesh)
 
 
 def matrix_to_world(obj: bpy.types.Object) -> np.ndarray:
@@ -94,14 +141,47 @@ def rest_placement(collection: bpy.types.Collection) -> np.ndarray:
 
 
 def _own(collection: bpy.types.Collection, pivot: bpy.types.Object) -> np.ndarray:
-    """Return the transform of the splats, or else of the mesh, relative to the pivot; identity if not moved."""
+    """Return the transform of the splats, or else of the mesh, relative to the pivot; exactly identity if not moved.
+
+    What Blender's operators have applied to the vertices counts as part of it.
+    """
     for kind in (SPLATS, MESH):
         part = part_of(collection, kind)
-        if part is not None and part.parent == pivot:
-            own = _map(part, pivot)
-            if not np.array_equal(own, np.eye(4)):
+        # A mesh of which the user has cleared or changed the parent alone serves another purpose.
+        if part is not None and (kind == SPLATS or part.parent in (pivot, pivot.parent)):
+            own = _map(part, pivot) @ carrier.applied_map(part.data)
+            if np.array_equal(own, np.eye(4)):
+                continue
+            base = matrix_to_world(pivot)
+            if np.abs(base @ own - base).max() > ROUNDING * np.abs(base).max():
                 return own
     return np.eye(4)
+
+
+def _own_parts(collection: bpy.types.Collection, pivot: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the parts of the object with this pivot, without those of copies that the user made with Blender."""
+    parts = [part for part in parts_of(collection) if kind_of(part) in (SPLATS, ANCHORS, MESH)]
+    return [part for part in parts if _pivot_above(part) in (pivot, None)]
+
+
+def _pivot_above(part: bpy.types.Object) -> bpy.types.Object | None:
+    above = part.parent
+    while above is not None and kind_of(above) != OBJECT_PARENT:
+        above = above.parent
+    return above
+
+
+def _place(obj: bpy.types.Object, wanted: np.ndarray) -> None:
+    """Set the map from an object's local coordinates to those of its parent or, without one, the world, (4, 4)."""
+    needed = Matrix(wanted.tolist())
+    location, rotation, scale = needed.decompose()
+    simple = Matrix.LocRotScale(location, rotation, scale)
+    size = np.abs(wanted[:3, :3]).max()
+    obj.matrix_parent_inverse.identity()
+    obj.matrix_basis = simple
+    if np.abs(np.array(simple) - wanted)[:3, :3].max() > EXACT * size and obj.parent is not None:
+        # The map contains shear, such as a nonuniform scale after a rotation.
+        obj.matrix_parent_inverse = needed @ simple.inverted()
 
 
 def _map(obj: bpy.types.Object, above: bpy.types.Object | None) -> np.ndarray:

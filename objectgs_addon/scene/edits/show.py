@@ -26,6 +26,7 @@ from .fills import show_fills
 from .floaters import hide_floaters
 from .placement import PLACEMENT, about, local_placement, placement_of, rest_placement, set_placement
 from .recolor import recolor_of, set_recolor
+from .recover import recover_parts
 
 REMOVED = "objectgs_removed"
 """Custom property of a removed object's collection: its previous visibility flags for viewports and renders."""
@@ -43,6 +44,7 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     Raises:
         InputError: Splats that would change are in Edit Mode.
     """
+    recover_parts(root)
     collections = object_collections(root)
     entries = objects.entries.values()
     hiding = {entry.id for entry in entries if entry.cleaned}
@@ -73,15 +75,6 @@ def recolor(root: bpy.types.Collection, object_id: int, wanted: Recolor | None) 
     for each in (collection, *duplicates_of(root).get(object_id, ())):
         set_recolor(each, wanted)
     return True
-
-
-def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> None:
-    """Move an object and its individually moved parts back to the captured pose."""
-    pivot = part_of(collection, OBJECT_PARENT)
-    for obj in pivot.children if pivot is not None else ():
-        obj.matrix_parent_inverse.identity()
-        obj.matrix_basis.identity()
-    set_placement(root, collection, None)
 
 
 Places = tuple[list | None, list]
@@ -136,6 +129,7 @@ def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | 
     if not path.exists():
         return
     if before is None and bpy.context.mode == "OBJECT":
+        recover_parts(root)
         adopt_blender_duplicates(root)
         for twins in duplicates_of(root).values():
             for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
@@ -241,8 +235,8 @@ def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list
     agreed = json.loads(collection[PLACEMENT]) if PLACEMENT in collection else None
     if agreed is not None and agreed["local"] == local.tolist():
         return agreed["stored"]
-    place = placement_of(root, collection)
-    return None if np.array_equal(place, np.eye(4)) else place.tolist()
+    place = placement_of(root, collection).tolist()
+    return None if _same(root, [None], [place]) else place
 
 
 def _is_flat(places: Places) -> bool:

@@ -12,7 +12,8 @@ from ....backend.shared.formats.mesh_ply import Mesh, read_mesh
 from ....backend.shared.formats.splat_ply import UNOBSERVED
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of
+from ..edits.placement import attach, move_to_transforms
+from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of, part_of
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
 from ..object_display import Objects
 from ..shading.materials import mesh_material
@@ -67,7 +68,8 @@ class MeshImporter:
         mesh_stamp, same_mesh = stamp_of(listed.mesh, known_mesh)
         texture_stamp, same_texture = stamp_of(listed.texture, known_texture)
         written = f"{mesh_stamp} {texture_stamp}"
-        if obj is not None and in_place and obj.parent is not None and same_mesh:
+        has_pivot = target is None or (in_place and part_of(collection, OBJECT_PARENT) is not None)
+        if obj is not None and in_place and has_pivot and same_mesh:
             if not same_texture:
                 self._update_texture(obj, listed)
             if written != before:
@@ -86,13 +88,14 @@ class MeshImporter:
             center = center_of(pivot)
         if obj is None:
             obj = self._new(listed, target, collection)
+            obj.parent = pivot
         elif not in_place:
             self.unlink(obj)
             collection.objects.link(obj)
             mark(obj, MESH, target)
             self.changed.add(target)
-        if obj.parent is None or not in_place:
-            obj.parent = pivot
+            attach(obj, pivot)
+        move_to_transforms(obj.data)
         fill_mesh(obj.data, positions - center, loaded)
         self._update_texture(obj, listed)
         obj[WRITTEN] = written
@@ -172,6 +175,7 @@ def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None
     mesh.validate(clean_customdata=False)
     mesh.normals_split_custom_set_from_vertices(np.nan_to_num(loaded.normals))
     mesh.update()
+    carrier.remember_positions(mesh)
 
 
 def _read(listed: ListedMesh) -> Mesh:

@@ -17,6 +17,7 @@ import numpy as np
 from ....backend.shared.errors import InputError
 from .. import carrier
 from ..edits.fills import replace_by_mesh
+from ..edits.recover import recover_parts
 from ..edits.show import show_edits
 from ..kinds import MESH, MESH_KEY, SPLATS, duplicates_of, kind_of, object_collections, object_id_of, parts_of
 from ..object_collection import remove, remove_if_empty
@@ -67,6 +68,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     folder = Path(folder)
     listed = read_listed(folder)
     objects = Objects.read(folder)
+    recover_parts(root)
     collections = object_collections(root)
     existing = _meshes_by_key(root, collections.values())
     if not listed and not existing:
