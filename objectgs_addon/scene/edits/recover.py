@@ -78,7 +78,7 @@ def _link_parts(root: bpy.types.Collection) -> None:
 def _home_of(
     part: bpy.types.Object, root: bpy.types.Collection, homes: list[bpy.types.Collection]
 ) -> bpy.types.Collection | None:
-    """Return the collection that a part was moved out of: one without it that holds others of the same object or none."""
+    """Return the collection that a part was moved out of: one without it that holds others of its object or none."""
     free = [
         home
         for home in homes
