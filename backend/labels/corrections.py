@@ -29,8 +29,8 @@ _OTHER, _OWN = 0.7, 0.1
 the second one to the object of its ID. An object of few points, at whose borders others show, is neither."""
 
 _MOSTLY_WRONG = 0.6
-"""An ID is not corrected if it seems wrong in more than this fraction of the views: its object has hardly any points,
-so that those behind it show through."""
+"""An ID is not corrected if it seems wrong in more than this fraction of the views whose points tell: its object has
+hardly any points, so that those behind it show through."""
 
 _THIN = 0.01
 """Half the width of unlabeled strips that are gaps between masks, relative to the longer side of a view."""
@@ -94,12 +94,14 @@ def correct_masks(
     # Validation views are trained on in the end.
     views = (*capture.train_indices, *capture.validation_indices)
     wrong = {}
+    wrong_in: Counter[int] = Counter()
+    right_in: Counter[int] = Counter()
     for index in views:
         check()
         wrong[index] = [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
-    shown_in = Counter(object_id for index in views for object_id in capture.ids_in(index))
-    wrong_in = Counter(object_id for ids in wrong.values() for object_id in set(ids))
-    kept = {object_id for object_id, views in wrong_in.items() if views > _MOSTLY_WRONG * shown_in[object_id]}
+        wrong_in.update(set(wrong[index]))
+        right_in.update(_confirmed(capture, index, point_ids) - set(wrong[index]))
+    kept = {each for each, views in wrong_in.items() if views > _MOSTLY_WRONG * (views + right_in[each])}
     wrong = {index: left for index, ids in wrong.items() if (left := [i for i in ids if i not in kept])}
 
     def correct(index: int, mask: np.ndarray) -> np.ndarray:
@@ -142,6 +144,18 @@ def _gaps(capture: Capture, index: int, mask: np.ndarray, point_ids: np.ndarray)
         spacing = np.sqrt(mask.size / len(points))
         gaps |= unlabeled & (ndimage.distance_transform_edt(at) <= _NEAR * spacing)
     return gaps
+
+
+def _confirmed(capture: Capture, index: int, point_ids: np.ndarray) -> set[int]:
+    """Return the IDs in a view's mask whose objects own enough of the points there, however few these are."""
+    mask = capture.uncorrected_mask(index)
+    if mask is None:
+        return set()
+    points, x, y = find_observed_points(capture, index)
+    at = mask[y, x]
+    found, which = np.unique(at, return_inverse=True)
+    own = np.bincount(which, at == point_ids[points], len(found))
+    return set(found[own > _OWN * np.bincount(which, minlength=len(found))].tolist())
 
 
 def _regions(capture: Capture, index: int, point_ids: np.ndarray) -> Iterator[Region]:
