@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import threading
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -129,6 +130,7 @@ class Capture:
         self.validation_indices: tuple[int, ...] = ()
         self._corrected: Collection[int] = ()
         self._correct: Callable[[int, np.ndarray], np.ndarray] | None = None
+        self._packed: dict[int, _PackedMask] = {}
 
     def __len__(self) -> int:
         return len(self.views)
@@ -158,7 +160,7 @@ class Capture:
                 known object.
         """
         other = copy.copy(self)
-        other._corrected, other._correct = indices, correct
+        other._corrected, other._correct, other._packed = indices, correct, {}
         return other
 
     def excluding_from_training(self, names: Collection[str]) -> Capture:
@@ -235,8 +237,7 @@ class Capture:
         """
         if self._correct is None or index not in self._corrected:
             return self.uncorrected_mask(index, downscale)
-        # The cache is shared with captures that have other corrections, or none. A correction takes long, so that masks
-        # of all sizes are of the same.
+        # The cache is shared with captures that have other corrections, or none. Masks of all sizes are of the same.
         ids = self._cache.get((self._correct, index), lambda: self._corrected_mask(index))
         return self.without_left_out(self._reduced(ids, index, downscale).astype(np.int64))
 
@@ -313,12 +314,19 @@ class Capture:
         return self._reduced(ids, index, downscale)
 
     def _corrected_mask(self, index: int) -> np.ndarray:
-        """Return the corrected mask in the smallest type that holds its IDs."""
+        """Return the corrected mask in the smallest type that holds its IDs.
+
+        It is kept compressed, whatever the cache drops: the correction takes much longer than the decompression.
+        """
+        if (packed := self._packed.get(index)) is not None:
+            return packed.unpacked()
         mask = self.uncorrected_mask(index)
         assert mask is not None and self._correct is not None
         ids = self._correct(index, mask)
         bounds = (np.min_scalar_type(int(each)) for each in (ids.min(initial=0), ids.max(initial=0)))
-        return ids.astype(np.result_type(*bounds))
+        ids = ids.astype(np.result_type(*bounds))
+        self._packed[index] = _PackedMask(zlib.compress(ids.tobytes(), 1), ids.dtype, ids.shape)
+        return ids
 
     def _reduced(self, ids: np.ndarray, index: int, downscale: int) -> np.ndarray:
         """Return the IDs at the centers of blocks of downscale x downscale pixels."""
@@ -349,6 +357,18 @@ def default_split(views: int) -> tuple[int, ...]:
 def needs_no_resampling(camera: Camera, width: int, height: int) -> bool:
     """Return whether a camera's image can be used unchanged as a view of this size."""
     return is_pinhole(camera) and (width, height) == (camera.width, camera.height)
+
+
+class _PackedMask(NamedTuple):
+    """A compressed mask."""
+
+    data: bytes
+    dtype: np.dtype
+    shape: tuple[int, ...]
+
+    def unpacked(self) -> np.ndarray:
+        """Return the mask."""
+        return np.frombuffer(zlib.decompress(self.data), self.dtype).reshape(self.shape)
 
 
 class _ArrayCache:

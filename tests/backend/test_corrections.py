@@ -67,8 +67,10 @@ def test_exchanged_ids_are_exchanged_back(scene, tmp_path):
             assert np.array_equal(corrected.mask(other), capture.mask(other))
 
 
-def test_masks_of_all_sizes_are_corrected_once(scene, tmp_path):
-    capture, _ = loaded(scene, tmp_path)
+@pytest.mark.parametrize("memory_mb", [2000, 0])
+def test_masks_of_all_sizes_are_corrected_once(scene, tmp_path, memory_mb):
+    """Also where the cache has no room for them."""
+    capture = load_capture(scene.folder, tmp_path / "cache", memory_mb)
     calls = []
 
     def correct(index, mask):
