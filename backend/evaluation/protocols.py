@@ -52,8 +52,8 @@ def evaluate(
         reporter: Receives the progress, and a warning for each render with NaN or Inf.
         zero_is_class: Count the ID 0 as an object, instead of as unlabeled.
         zero_is_background: Whether 0 means background, so that `miou_all` is shown as the progress instead of `miou`.
-        alone: Function that returns the IDs and the alphas (h, w) of the objects in a view, each rendered alone; used
-            if 0 means background.
+        alone: Function that returns the IDs and the alphas (h, w) of the objects in a view, each rendered alone,
+            except those out of view; used if 0 means background.
 
     Returns:
         {"quality": {psnr, psnr_corrected, ssim, lpips, miou, miou_all, miou_alone, mbiou, dice, accuracy}, "objects":
@@ -85,9 +85,10 @@ def evaluate(
             found_scores = view_ids.result()
             of_view = {key: found_scores[key] for key in of_view}
             if alone and zero_is_background and not zero_is_class:
-                # The model may lack objects that the masks show.
+                # The model may lack objects that the masks show, or have them elsewhere.
                 missing = set(np.unique(truth[truth > 0]).tolist())
                 for object_id, shown in alone(i):
+                    reporter.check()
                     of_objects_alone.add(object_id, shown, truth)
                     missing.discard(object_id)
                 for object_id in sorted(missing):

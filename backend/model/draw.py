@@ -87,20 +87,22 @@ def _drawn(model: ObjectModel, camera: Camera, want_ids: bool, want_depth: bool)
 
 
 def objects_alone(model: ObjectModel, camera: Camera) -> Iterator[tuple[int, np.ndarray]]:
-    """Render each object of a model without the others.
+    """Render each object of a model that has splats in a view, without the others.
 
     Args:
         model: the model.
         camera: the view, in scene units.
 
     Yields:
-        The ID of each object but 0, and its alpha (H, W) float32, which is 0 for an object out of view.
+        The ID of each object but 0, and its alpha (H, W) float32.
     """
     viewmat, intrinsics = camera.arrays()
     seen = anchors_in_view(model.anchors, viewmat, intrinsics, camera.width, camera.height, camera.near)
     with torch.no_grad():
         splats = model.generate(seen, camera.center).only_valid()
-        for number, object_id in enumerate(model.classes.ids.tolist()):
+        numbers, counts = splats.ids.unique(return_counts=True)
+        by_object = splats.ids.argsort(stable=True).split(counts.tolist())
+        for object_id, own in zip(model.classes.ids_of(devices.host(numbers)).tolist(), by_object, strict=True):
             if object_id:
-                alone = splats.select(splats.ids == number)
+                alone = splats.select(own)
                 yield object_id, devices.host(rasterize(*alone[:6], camera, primitive=model.primitive).alpha)

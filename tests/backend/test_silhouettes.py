@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from backend.model.draw import objects_alone
 from backend.model.object_model import anchors_in_view
 from backend.raster import Camera, rasterize
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR
@@ -93,3 +94,24 @@ def test_a_step_has_no_such_loss_where_nothing_is_known_of_the_background(tiny, 
     trainer = Trainer.start(capture, ids, given, supervise_background=supervised)
     index = capture.train_indices[0]
     assert of_step(trainer, index, True) == of_step(trainer, index, False)
+
+
+def test_objects_in_view_are_rendered_alone(tiny) -> None:
+    """Objects out of view are left out, so that a view of a large model does not render all of its objects."""
+    capture, ids = tiny()
+    trainer = Trainer.start(capture, ids, Settings(offsets=2))
+    camera, model = trainer.scene.camera(capture.test_indices[0]), trainer.model
+    away = int(model.classes.classes_of([2])[0])
+    # Behind the camera.
+    model.anchors.positions[model.anchors.ids == away] = torch.from_numpy(
+        np.linalg.inv(camera.viewmat)[:3] @ [0, 0, -5, 1]
+    ).float()
+    with torch.no_grad():
+        splats = model.generate(anchors_in_view(model.anchors, *frustum(camera)), camera.center)
+        expected = {}
+        for object_id in set(capture.object_ids.tolist()) - {2}:
+            number = int(model.classes.classes_of([object_id])[0])
+            expected[object_id] = rasterize(*splats.select(splats.ids == number)[:6], camera).alpha.numpy()
+    found = dict(objects_alone(model, camera))
+    assert list(found) == sorted(expected) and all(alpha.max() > 0 for alpha in found.values())
+    assert all(np.array_equal(found[object_id], alpha) for object_id, alpha in expected.items())
