@@ -62,6 +62,8 @@ class TrainingProgress:
         evaluated: for a training of known length, the number of evaluations so far; for a training until convergence,
             the step of the latest one.
         grown: whether growth has ended.
+        plateau_at: step at which the plateau of a training until convergence began, or began again after a training of
+            known length or an earlier decay; None for one of known length.
         converged_at: step at which the plateau ended and the learning rate decay began; 0 before.
         ends_at: step at which the decay ends; 0 before, and in checkpoints of earlier versions.
         limited: whether the time limit has ended the plateau, before the training has converged.
@@ -88,6 +90,7 @@ class TrainingProgress:
     joined: bool = False
     ends_at: int = 0
     limited: bool = False
+    plateau_at: int | None = None
 
     @property
     def latest(self) -> dict[str, Any]:
@@ -198,10 +201,12 @@ class Budget:
                 before = convergence_step([e for e in p.curve if e["step"] <= p.converged_at], _WORTHWHILE_BEFORE)
                 p.limited = bool(p.curve) and (before is None or p.converged_at < before)
             if p.limited and not self._is_limited(p):
-                p.converged_at, p.ends_at, p.limited = 0, 0, False
+                p.converged_at, p.ends_at, p.limited, p.plateau_at = 0, 0, False, None
             if not p.converged_at:
                 p.leave()
+                p.plateau_at = p.step if p.plateau_at is None else p.plateau_at
         else:
+            p.plateau_at = None
             p.evaluated = bisect_right(_EVALUATIONS, self.progress(p))
 
     def evaluation_is_due(self, p: TrainingProgress) -> bool:
@@ -226,7 +231,7 @@ class Budget:
         """
         if not self.until_converged or p.converged_at:
             return False
-        p.grown = p.grown or _growth_has_ceased(p.curve)
+        p.grown = p.grown or _growth_has_ceased(p)
         converged = convergence_step(p.curve)
         has_converged = converged is not None and p.step >= max(converged, WARM_UP)
         if not self._out_of_time(p) and not has_converged:
@@ -307,11 +312,15 @@ def convergence_step(curve: list[dict[str, Any]], worthwhile: float = WORTHWHILE
     return LOOKAHEAD / (2 ** (worthwhile / octave) - 1) if octave > worthwhile / 100 else 0.0
 
 
-def _growth_has_ceased(curve: list[dict[str, Any]]) -> bool:
-    """Return whether the number of anchors has stopped growing; curves of older trainings may not contain it."""
-    counted = [(entry["step"], entry["anchors"]) for entry in curve if "anchors" in entry]
+def _growth_has_ceased(p: TrainingProgress) -> bool:
+    """Return whether the number of anchors has stopped growing on the plateau, before which growth may have been off.
+
+    Curves of older trainings may not contain the number.
+    """
+    counted = [(entry["step"], entry["anchors"]) for entry in p.curve if "anchors" in entry]
     last, now = counted[-1] if counted else (0, 0)
-    before = [anchors for step, anchors in counted if WARM_UP <= step <= last / 2**GROWTH_OCTAVES]
+    first = max(WARM_UP, p.plateau_at or 0)
+    before = [anchors for step, anchors in counted if first <= step <= last / 2**GROWTH_OCTAVES]
     return bool(before) and now < MIN_GROWTH * before[-1]
 
 

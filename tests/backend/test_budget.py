@@ -239,6 +239,40 @@ def test_growth_lasts_while_anchor_count_rises():
     assert walk(PRESETS["final"], math.log1p, 5000, anchors=lambda step: 1000 + 500 * (step > 2500)).grown
 
 
+@pytest.mark.parametrize("stop_every", [10**9, 300])
+def test_growth_begins_again_after_a_training_of_known_length(stop_every):
+    """The anchors of its last part, in which nothing grew, tell nothing of the growth on the plateau."""
+    p, final = TrainingProgress(), PRESETS["final"]
+    for budget, last in ((Budget(steps=3000), 3000), (final, 3000 * math.sqrt(2) * 1.2)):
+        budget.begin(p)
+        while p.step < last:
+            p.step += 1
+            if budget.evaluation_is_due(p):
+                anchors = min(p.step, 1800) + max(p.step - 3000, 0) // 20
+                p.curve.append({"step": p.step, "validation_psnr": math.log2(p.step) ** 2, "anchors": anchors})
+                assert not budget.check_convergence(p)
+            if p.step % stop_every == 0:
+                budget.begin(p)
+            assert not p.grown
+    assert p.plateau_at == 3000
+    grown = p.curve[-1]["anchors"]
+    while not p.grown:
+        p.step += 1
+        if final.evaluation_is_due(p):
+            p.curve.append({"step": p.step, "validation_psnr": math.log2(p.step) ** 2, "anchors": grown})
+            final.check_convergence(p)
+    assert p.step < 3 * 3000
+    Budget(steps=p.step + 1000).begin(p)
+    assert p.plateau_at is None
+
+
+def test_growth_begins_again_where_a_longer_limit_extends_the_plateau():
+    p = walk(Budget(seconds=100.0, until_converged=True), lambda step: math.log2(step + 1))
+    assert p.limited and p.plateau_at == 0
+    Budget(seconds=300.0, until_converged=True).begin(p)
+    assert p.plateau_at == p.step and not p.converged_at
+
+
 def test_curve_without_anchor_counts_keeps_growth():
     p = TrainingProgress(step=3000, curve=curve_of(range(WARM_UP, 3000, 300), lambda step: step))
     assert not PRESETS["final"].check_convergence(p) and not p.grown
