@@ -73,6 +73,7 @@ class TrainingProgress:
         joined: whether the validation views are trained on, too, after they have decided on the end.
         watched: training views that are spared, as `overfitting` describes.
         dropped: fraction of the splats that each step leaves out.
+        smooth_loss: mean of the latest losses, as far as it is known; kept up to date when the training is saved.
     """
 
     step: int = 0
@@ -91,6 +92,7 @@ class TrainingProgress:
     ends_at: int = 0
     limited: bool = False
     plateau_at: int | None = None
+    smooth_loss: float | None = None
 
     @property
     def latest(self) -> dict[str, Any]:

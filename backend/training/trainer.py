@@ -34,13 +34,7 @@ from .processes.shared_views import Outcome, SharedViews
 from .processes.team import Order, Processes, Team
 from .scene import Scene
 from .settings import Settings, background_is_masked
-from .state import (
-    model_from_checkpoint,
-    read_checkpoint,
-    require_settings,
-    training_state,
-    training_tensors,
-)
+from .state import model_from_checkpoint, read_checkpoint, require_settings, training_state, training_tensors
 from .step import ALONE_EVERY, IN_PARTS, ViewGradients, ViewStep
 
 if TYPE_CHECKING:
@@ -69,6 +63,7 @@ class Trainer:
         self.model = model
         self.rng = rng
         self.progress = TrainingProgress()
+        self._smooth = torch.full((), math.nan, device=model.device)
         self.region = region or Region()
         self.optimizer = ModelOptimizer(model, settings, self.region, tensors)
         self.view_step = ViewStep(
@@ -144,6 +139,8 @@ class Trainer:
         """
         model, optimizer = self.model, self.optimizer
         self.progress.skipped += optimizer.check.take_skipped()
+        smooth = float(self._smooth)
+        self.progress.smooth_loss = smooth if math.isfinite(smooth) else None
         tensors = training_tensors(
             model, optimizer.rows, optimizer.growth, optimizer.average, optimizer.heads, self.view_step.colors,
         )  # fmt: skip
@@ -209,6 +206,8 @@ class Trainer:
         trainer = cls(scene, settings, model.to(device), rng, Region.of(state), tensors)
         trainer.view_step.restore(tensors)
         trainer.progress = TrainingProgress(**state["progress"])
+        if trainer.progress.smooth_loss is not None:
+            trainer._smooth.fill_(trainer.progress.smooth_loss)
         return trainer
 
     def run(
@@ -265,12 +264,11 @@ class Trainer:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
         started = last_saved = last_report = awake_seconds()
-        smooth = torch.full((), math.nan, device=self.model.device)
         parts = self.parts
         while True:
             p.seconds = before + awake_seconds() - started
             if evaluate is not None and budget.evaluation_is_due(p):
-                self._evaluate(evaluate, reporter, float(smooth), budget.progress(p))
+                self._evaluate(evaluate, reporter, float(self._smooth), budget.progress(p))
                 if budget.check_convergence(p):
                     reporter.status(plateau_end(p))
                     if p.join(capture.validation_indices):
@@ -295,7 +293,8 @@ class Trainer:
             loss = self.step(progress)
             while self._warnings:
                 reporter.warning(self._warnings.pop(0))
-            smooth = torch.where(smooth.isnan(), loss, smooth.lerp(loss, 0.05))
+            smoothed = torch.where(self._smooth.isnan(), loss, self._smooth.lerp(loss, 0.05))
+            self._smooth = torch.where(loss.isnan(), self._smooth, smoothed)
             if parts == 1 < self.parts:
                 reporter.warning(IN_PARTS.format(parts=self.parts))
                 parts = self.parts
@@ -303,7 +302,7 @@ class Trainer:
             if now - last_report >= _REPORT_SECONDS:
                 last_report = now
                 p.seconds = before + now - started
-                self._report(budget, reporter, float(smooth), (now - started) / (p.step - first_step))
+                self._report(budget, reporter, float(self._smooth), (now - started) / (p.step - first_step))
                 self.optimizer.check.watch()
             if now - last_saved >= checkpoint_seconds:
                 self.save(checkpoints)

@@ -536,12 +536,26 @@ def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
     assert warning is None and resumed.progress.step == 17
     resumed.run(Budget(steps=40), tmp_path / "c", Reporter())
     assert (whole.model.anchors.rows == resumed.model.anchors.rows).all()
+    assert whole.progress.smooth_loss == resumed.progress.smooth_loss is not None
     for a, b in zip(whole.model.heads.parameters(), resumed.model.heads.parameters()):
         assert (a == b).all()
 
     other = Trainer.start(capture, ids, Settings(offsets=4, sh_degree=1, seed=1))
     other.run(Budget(steps=40), tmp_path / "d", Reporter())
     assert not np.array_equal(whole.model.anchors.rows, other.model.anchors.rows)
+
+
+def test_steps_without_a_loss_do_not_change_the_smooth_loss(tiny, tmp_path, monkeypatch):
+    trainer = Trainer.start(*tiny(), SMALL)
+    losses = iter([math.nan, 4.0, math.nan, 2.0, math.nan])
+
+    def step(_):
+        trainer.progress.step += 1
+        return torch.tensor(next(losses))
+
+    monkeypatch.setattr(trainer, "step", step)
+    trainer.run(Budget(steps=5), tmp_path, Reporter())
+    assert trainer.progress.smooth_loss == pytest.approx(3.9)
 
 
 def test_checkpoint_of_other_settings_is_rejected(tiny, tmp_path):

@@ -71,7 +71,9 @@ def begin_with_labels(
     tensors, state, _ = require_checkpoint(checkpoint)
     settings = {**state["settings"], "semantic_weight": semantic_weight}
     state = {**state, "settings": settings, "supervise_background": supervise_background}
-    plateau = {"watched": [], "grown": False, "converged_at": 0, "ends_at": 0, "limited": False}
+    plateau = {
+        "watched": [], "grown": False, "converged_at": 0, "ends_at": 0, "limited": False, "smooth_loss": None
+    }  # fmt: skip
     state["progress"] = {**state["progress"], **plateau}
     return Trainer.restore(capture, relabeled(tensors, state, source, object_ids), state, memory_mb, device, gains)
 
