@@ -107,6 +107,11 @@ class TrainingProgress:
         self.queue += validation
         return True
 
+    def joining(self, before: TrainingProgress, validation: Sequence[int]) -> list[int]:
+        """Return the views that are trained on now, but were not at the progress `before`."""
+        validated = validation if self.joined and not before.joined else ()
+        return [*validated, *(() if self.watched else before.watched)]
+
     def leave(self) -> None:
         """Train without the validation views again, since they decide on the end."""
         if self.joined:

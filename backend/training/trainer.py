@@ -6,6 +6,7 @@ results are read when the training reports or saves.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Callable, Sequence
@@ -256,11 +257,10 @@ class Trainer:
         checkpoint_seconds: float,
     ) -> None:
         p = self.progress
-        before = p.seconds
-        first_step = p.step
+        before, first_step = p.seconds, p.step
         budget.begin(p)
-        capture = self.scene.capture
-        if evaluate is not None and not p.step and not capture.validation_indices:
+        capture, validation = self.scene.capture, self.scene.capture.validation_indices
+        if evaluate is not None and not p.step and not validation:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
         started = last_saved = last_report = awake_seconds()
@@ -268,13 +268,14 @@ class Trainer:
         while True:
             p.seconds = before + awake_seconds() - started
             if evaluate is not None and budget.evaluation_is_due(p):
+                earlier = copy.copy(p)
                 self._evaluate(evaluate, reporter, float(self._smooth), budget.progress(p))
                 if budget.check_convergence(p):
                     reporter.status(plateau_end(p))
-                    if p.join(capture.validation_indices):
-                        begin_colors(self.view_step.colors, self.shown, self.scene)
+                    p.join(validation)
                 if overfitting.watch(p, budget):
                     reporter.status(overfitting.OVERFITS)
+                begin_colors(self.view_step.colors, self.shown, self.scene, p.joining(earlier, validation))
                 self._team.tell_state(p.__dict__)
             progress = budget.progress(p)
             if progress >= 1.0:
@@ -438,9 +439,9 @@ class Trainer:
         while True:
             order, progress, closely = team.wait()
             if order == Order.STATE:
-                joined, self.progress = self.progress.joined, TrainingProgress(**team.receive())
-                if self.progress.joined and not joined:
-                    begin_colors(self.view_step.colors, self.shown, self.scene)
+                before, self.progress = self.progress, TrainingProgress(**team.receive())
+                joining = self.progress.joining(before, self.scene.capture.validation_indices)
+                begin_colors(self.view_step.colors, self.shown, self.scene, joining)
             elif order == Order.STEP:
                 self.optimizer.check.at_once = closely
                 self.step(progress)

@@ -126,6 +126,8 @@ def test_validation_views_join_once():
     assert not p.join(()) and not p.joined
     assert p.join((7, 8, 9)) and p.queue == [1, 2, 7, 8, 9]
     assert not p.join((7, 8, 9)) and len(p.queue) == 5
+    before = TrainingProgress(watched=[3])
+    assert p.joining(before, (7, 8)) == [7, 8, 3] and p.joining(p, (7, 8)) == before.joining(before, (7, 8)) == []
 
 
 def test_stops_do_not_delay_the_end_of_a_training_until_convergence():

@@ -9,6 +9,7 @@ from backend.model.generate import Generated
 from backend.shared.errors import Cancelled
 from backend.shared.stopping import StopRequest
 from backend.training import overfitting
+from backend.training import trainer as trainer_module
 from backend.training.budget import Budget, TrainingProgress
 from backend.training.overfitting import Dropout, choose_watched_views, dropout_at, watch
 from backend.training.settings import Settings
@@ -93,7 +94,8 @@ def test_training_spares_views_and_then_drops_splats(tiny, tmp_path, monkeypatch
     monkeypatch.setattr(overfitting, "WATCHED", 1)
     monkeypatch.setattr(overfitting, "POINTS_PER_VIEW", 10**6)
     trainer = Trainer.start(capture, point_ids, Settings(offsets=2))
-    trained, rates, reporter = [], [], Silent()
+    trained, rates, begun, reporter = [], [], [], Silent()
+    monkeypatch.setattr(trainer_module, "begin_colors", lambda colors, model, scene, indices: begun.extend(indices))
     measured, compute = iter([20.0, 21.0, 20.0]), trainer.view_step.compute
 
     def recorded(index, progress, dropout=None, **options):
@@ -116,7 +118,7 @@ def test_training_spares_views_and_then_drops_splats(tiny, tmp_path, monkeypatch
     first = rates.index(overfitting.DROPPED)
     assert len(spared) == 1 and not spared & set(trained[:first])
     assert set(rates[first:]) == {overfitting.DROPPED} and reporter.said == [overfitting.OVERFITS]
-    assert spared < set(trained[first:])
+    assert spared < set(trained[first:]) and begun == list(spared)
     monkeypatch.undo()
     resumed, _ = Trainer.resume(capture, tmp_path / "checkpoint")
     assert resumed.progress.dropped == overfitting.DROPPED and resumed.progress.watched == []

@@ -40,6 +40,18 @@ def test_known_corrections_are_recovered() -> None:
     assert colors.values[:4].mean(0).abs().max() < 1e-6
 
 
+def test_correction_of_a_spared_photo_does_not_drift() -> None:
+    colors = PhotoColors(3, range(3), devices.CPU)
+    for _ in range(20):
+        colors.step(0, torch.ones((2, 3)), 0.0)
+        colors.step(1, -torch.ones((2, 3)) * 2, 0.0)
+        assert not colors.values[2].any()
+    assert colors.values[:2].any() and colors.values.mean(0).abs().max() < 1e-6
+    colors.values[2] = 0.3
+    colors.step(2, torch.ones((2, 3)), 0.0)
+    assert colors.values.mean(0).abs().max() < 1e-6, "once it is trained on, it counts"
+
+
 def test_unusable_gradient_changes_nothing() -> None:
     colors = PhotoColors(2, (0, 1), devices.CPU)
     colors.step(0, torch.ones((2, 3)), 0.0)
@@ -52,6 +64,7 @@ def test_unusable_gradient_changes_nothing() -> None:
 def test_corrections_are_restored_from_checkpoints_of_the_same_photos(photos: int) -> None:
     colors, other = PhotoColors(2, (0, 1), devices.CPU), PhotoColors(photos, (0, 1), devices.CPU)
     colors.step(0, torch.ones((2, 3)), 0.0)
+    colors.step(1, -torch.ones((2, 3)), 0.0)
     other.restore({name: tensor.numpy() for name, tensor in colors.tensors().items()})
     assert other.values.any() == (photos == 2)
     other.restore({})

@@ -3,8 +3,8 @@
 A photo may be brighter, warmer or flatter than the others, since the camera chooses exposure and white balance, and
 processes the picture. Photo i is compared with exp(a_i) render + b_i in each channel, where the log gain a_i and the
 offset b_i are fitted together with the splats. `gains` supplies the first approximation; here the rest is fitted,
-from all pixels. Gains and offsets have a mean of 0 over the training views, as the splats could absorb a common one,
-and are drawn toward 0, so that photos of constant exposure keep none.
+from all pixels. Gains and offsets have a mean of 0 over the views trained on so far, as the splats could absorb a
+common one, and are drawn toward 0, so that photos of constant exposure keep none.
 
 Held-out views and new cameras have no correction.
 """
@@ -86,7 +86,11 @@ class PhotoColors:
             (self.steps, steps), (self.exp_avg, exp_avg), (self.exp_avg_sq, exp_avg_sq), (self.values, changed)
         ):  # fmt: skip
             stored[index] = torch.where(usable, value, stored[index])
-        self.values[self._fitted] -= self.values[self._fitted].mean(dim=0)
+        # Photos that are spared so far would only drift away, since no step of their own draws them back.
+        trained = (self.steps[self._fitted] > 0).to(self.values)[:, None, None]
+        fitted = self.values[self._fitted]
+        mean = (fitted * trained).sum(dim=0) / trained.sum().clamp(min=1)
+        self.values[self._fitted] = fitted - mean * trained
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the corrections and moments as tensors for a checkpoint."""
@@ -103,20 +107,21 @@ class PhotoColors:
                 stored.copy_(torch.from_numpy(found.copy()))
 
 
-def begin_colors(colors: PhotoColors | None, model: ObjectModel, scene: Scene) -> None:
-    """Fit the corrections of the validation views to renders, where they join a training that is nearly done.
+def begin_colors(colors: PhotoColors | None, model: ObjectModel, scene: Scene, indices: Sequence[int]) -> None:
+    """Fit the corrections of views to renders, where they join a training that has not seen them so far.
 
     Args:
         colors: the corrections, changed in place; None: photos have none.
         model: the model as trained so far.
         scene: the scene with the photos.
+        indices: the views.
 
     Raises:
         InputError: a photo cannot be read.
     """
     if colors is None:
         return
-    for index in scene.capture.validation_indices:
+    for index in indices:
         render = draw(model, scene.camera(index), want_ids=False).image
         found = fit_correction(render, scene.capture.image(index) / 255)
         colors.values[index] = torch.from_numpy(found).to(colors.values)
