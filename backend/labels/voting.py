@@ -99,7 +99,10 @@ def vote(
     def cast(index: int, points: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
         mask = capture.mask(index)
         assert mask is not None
-        ballots.add(points, classes.classes_of(mask[y, x]))
+        ids = mask[y, x]
+        # Ignored pixels of corrected masks show no known object, but not none either.
+        known = ids >= 0
+        ballots.add(points[known], classes.classes_of(ids[known]))
 
     xyz = np.ascontiguousarray(voters.T, np.float64)
     nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)

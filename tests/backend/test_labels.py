@@ -101,6 +101,13 @@ def test_unlabeled_is_a_candidate():
     assert votes.ids.tolist() == [0] and votes.margins.tolist() == [1.0] and votes.visible.tolist() == [3]
 
 
+def test_ignored_pixels_do_not_vote():
+    capture = given(elsewhere(-1, -1, -1, 7), [[0, 0, 1.0]])
+    capture.known_ids = np.array([7])
+    votes = vote(capture)
+    assert votes.ids.tolist() == [7] and votes.margins.tolist() == [1.0] and votes.visible.tolist() == [1]
+
+
 def test_masks_without_labels_do_not_vote():
     votes = vote(given([*plain(0, 0, 0), *elsewhere(5)], [[0, 0, 1.0]]))
     assert votes.ids.tolist() == [5] and votes.margins.tolist() == [1.0] and votes.visible.tolist() == [1]
