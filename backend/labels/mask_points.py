@@ -7,13 +7,17 @@ enter the space that the other masks agree on (the visual hull, Laurentini 1994)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from ..capture import Capture
-from ..shared.stopping import Check, proceed
+from ..shared.class_table import ClassTable
+from ..shared.events import Reporter
+from ..shared.stopping import Check
 
 MOST_POINTS = 400
 """Largest number of points for an object."""
@@ -36,39 +40,97 @@ class MaskPoints(NamedTuple):
     ids: np.ndarray
 
 
-def place_points(capture: Capture, object_ids: Sequence[int], seed: int = 0, check: Check = proceed) -> MaskPoints:
+class _Shown(NamedTuple):
+    """Where a mask shows an object: inside (h, w) bool, in the window whose first row and column are top and left."""
+
+    top: int
+    left: int
+    inside: np.ndarray
+
+    def shows(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return whether the mask shows the object at pixels (n,): (n,) bool."""
+        rows, columns = rows - self.top, columns - self.left
+        height, width = self.inside.shape
+        result = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        result[result] = self.inside[rows[result], columns[result]]
+        return result
+
+
+class _Masks:
+    """The masks of the training views that show any of some objects, each read once.
+
+    Attributes:
+        shown: for each object and view whose mask lists it, where.
+        ignored: for each view with pixels of no known object, these: (H, (W + 7) // 8) uint8, eight pixels a byte.
+    """
+
+    def __init__(self, capture: Capture, object_ids: Sequence[int], check: Check) -> None:
+        self.shown: dict[int, dict[int, _Shown]] = {object_id: {} for object_id in object_ids}
+        self.ignored: dict[int, np.ndarray] = {}
+        wanted = ClassTable(list(object_ids))
+        for index in capture.train_indices:
+            listed = sorted(set(capture.ids_in(index)) & set(self.shown))
+            mask = capture.mask(index) if listed else None
+            if mask is None:
+                continue
+            check()
+            windows = ndimage.find_objects(wanted.classes_of(mask) + 1, len(wanted))
+            for object_id in listed:
+                window = windows[int(wanted.classes_of(object_id))] or (slice(0, 0), slice(0, 0))
+                self.shown[object_id][index] = _Shown(window[0].start, window[1].start, mask[window] == object_id)
+            if (mask < 0).any():
+                self.ignored[index] = np.packbits(mask < 0, axis=1)
+
+    def knows(self, index: int, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return whether a view's mask tells what pixels (n,) show: (n,) bool."""
+        if index not in self.ignored:
+            return np.ones(len(rows), np.bool_)
+        return (self.ignored[index][rows, columns >> 3] >> (7 - (columns & 7))) & 1 == 0
+
+
+def place_points(
+    capture: Capture, object_ids: Sequence[int], seed: int = 0, reporter: Reporter | None = None
+) -> MaskPoints:
     """Place points of objects where their masks in the training views agree.
 
     Args:
         capture: The capture; must be prepared.
         object_ids: The objects.
         seed: For the choice of pixels and points.
-        check: Called at intervals; ends the work by an exception once the user wants to stop.
+        reporter: Receives progress; its check ends the work by an exception once the user wants to stop.
 
     Returns:
         Up to MOST_POINTS points for each object; none for an object whose masks agree nowhere or that fewer than two
         views show.
     """
+    reporter = reporter or Reporter()
+    masks = _Masks(capture, object_ids, reporter.check)
+    depths = functools.cache(lambda index: _depths(capture, index))
     parts = []
-    for object_id in object_ids:
-        check()
-        parts.append(_points_of(capture, object_id, np.random.default_rng([seed, object_id])))
+    for done, object_id in enumerate(object_ids, 1):
+        parts.append(_points_of(capture, masks, object_id, depths, np.random.default_rng([seed, object_id])))
+        reporter.progress(done, len(object_ids), what="objects")
     found = [(xyz, rgb, np.full(len(xyz), i, np.int64)) for (xyz, rgb), i in zip(parts, object_ids, strict=True)]
     nothing = (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
     return MaskPoints(*(np.concatenate(columns) for columns in zip(nothing, *found, strict=True)))
 
 
-def _points_of(capture: Capture, object_id: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (M, 3) and colors (M, 3) of the points of one object."""
-    shown_in = [index for index in capture.train_indices if object_id in capture.ids_in(index)]
-    masks = {index: mask == object_id for index in shown_in if (mask := capture.mask(index)) is not None}
-    if len(masks) < 2:
+def _points_of(
+    capture: Capture,
+    masks: _Masks,
+    object_id: int,
+    depths: Callable[[int], np.ndarray],
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions (M, 3) and colors (M, 3) of the points of one object; depths: `_depths` of a view."""
+    shown = masks.shown[object_id]
+    if len(shown) < 2:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    chosen = np.unique(np.linspace(0, len(masks) - 1, min(len(masks), _VIEWS)).astype(int))
+    chosen = np.unique(np.linspace(0, len(shown) - 1, min(len(shown), _VIEWS)).astype(int))
     positions, colors = [], []
-    for index in np.array(list(masks))[chosen].tolist():
-        rays, seen = _rays(capture, index, masks[index], rng)
-        agreed = _agreement(capture, masks, rays.reshape(-1, 3)).reshape(rays.shape[:2]) >= _AGREEMENT
+    for index in np.array(list(shown))[chosen].tolist():
+        rays, seen = _rays(capture, index, shown[index], depths(index), rng)
+        agreed = _agreement(capture, masks, object_id, rays.reshape(-1, 3)).reshape(rays.shape[:2]) >= _AGREEMENT
         hit = agreed.any(1)
         positions.append(rays[hit, agreed[hit].argmax(1)])
         colors.append(seen[hit])
@@ -77,35 +139,39 @@ def _points_of(capture: Capture, object_id: int, rng: np.random.Generator) -> tu
     return xyz[keep], rgb[keep]
 
 
-def _rays(capture: Capture, index: int, mask: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions along the rays of pixels of a mask, (n, _DEPTHS, 3), near to far, and the pixels' colors."""
+def _depths(capture: Capture, index: int) -> np.ndarray:
+    """Return the depths (_DEPTHS,) that are tried along the rays of a view."""
     view = capture.views[index]
-    rotation, translation = view.viewmat[:3, :3], view.viewmat[:3, 3]
-    depths = capture.points.xyz @ rotation[2] + translation[2]
+    depths = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
     near, far = np.percentile(depths[depths > 0], [1, 99]) if (depths > 0).any() else (0.1, 10.0)
-    rows, columns = np.nonzero(mask)
+    return np.geomspace(_NEARER * near, _FARTHER * far, _DEPTHS)
+
+
+def _rays(
+    capture: Capture, index: int, shown: _Shown, depths: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions at depths along the rays of pixels that show an object, (n, _DEPTHS, 3), and their colors."""
+    view = capture.views[index]
+    rows, columns = np.nonzero(shown.inside)
     picked = rng.permutation(len(rows))[:_PIXELS]
-    rows, columns = rows[picked], columns[picked]
+    rows, columns = rows[picked] + shown.top, columns[picked] + shown.left
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1)
     directions = pixels @ np.linalg.inv(view.K).T
-    along = np.geomspace(_NEARER * near, _FARTHER * far, _DEPTHS)
-    in_camera = directions[:, None] * along[:, None]
-    return (in_camera - translation) @ rotation, capture.image(index)[rows, columns]
+    in_camera = directions[:, None] * depths[:, None]
+    return (in_camera - view.viewmat[:3, 3]) @ view.viewmat[:3, :3], capture.image(index)[rows, columns]
 
 
-def _agreement(capture: Capture, masks: dict[int, np.ndarray], xyz: np.ndarray) -> np.ndarray:
+def _agreement(capture: Capture, masks: _Masks, object_id: int, xyz: np.ndarray) -> np.ndarray:
     """Return the fraction (n,) of the views with the positions (n, 3) inside whose masks show the object there.
 
-    Where fewer than two views have a position inside, it is 0.
+    Views that tell nothing of a position do not count. Where fewer than two views count, it is 0.
     """
     inside, agreeing = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
-    for index, mask in masks.items():
+    for index, shown in masks.shown[object_id].items():
         view = capture.views[index]
-        in_camera = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            x = in_camera[:, 0] / in_camera[:, 2] * view.K[0, 0] + view.K[0, 2]
-            y = in_camera[:, 1] / in_camera[:, 2] * view.K[1, 1] + view.K[1, 2]
-            shown = (in_camera[:, 2] > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
-        inside += shown
-        agreeing[shown] += mask[y[shown].astype(np.int64), x[shown].astype(np.int64)]
+        found, columns, rows = view.pixels_of(xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
+        known = masks.knows(index, rows, columns)
+        found, columns, rows = found[known], columns[known], rows[known]
+        inside[found] += 1
+        agreeing[found] += shown.shows(rows, columns)
     return np.where(inside >= 2, agreeing / np.maximum(inside, 1), 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from backend.planning.decisions import (
     planned_settings,
 )
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
+from backend.shared.events import Reporter
 from backend.shared.grouping import changed, chosen, grouped, read_groups
 from backend.shared.reconstruction.objects import edit_objects, merged, read_objects
 from backend.shared.reconstruction.plan import KEYS, Decision, Plan, read_plan, write_plan
@@ -266,7 +268,7 @@ def test_planning_stops_when_it_is_asked_to(write_capture, tmp_path, run_command
         duplicate_views,
         views_like_held_out,
         blind_views,
-        lambda *inputs: place_points(inputs[0], [1], 0, cancel),
+        lambda capture, cancel: place_points(capture, [1], 0, Mock(Reporter, check=cancel)),
     ):
         with pytest.raises(Cancelled):
             work(capture, cancel)

@@ -22,6 +22,12 @@ DENSE = "dense"
 _SECONDS = 0.4
 """Typical time of the search for dense points in a photo."""
 
+PLACE = "place-points"
+"""Name of the placing of points of objects that have none, among the parts of a command."""
+
+_SECONDS_AN_OBJECT = 0.5
+"""Typical time of it for an object."""
+
 
 class StartingPoints(NamedTuple):
     """Points to begin with.
@@ -81,7 +87,9 @@ def _dense(capture: Capture, seeds: np.ndarray, reporter: StoppingReporter) -> t
 
 def _place(capture: Capture, missing: list[int], seed: int, reporter: Reporter) -> MaskPoints:
     """Place points for the objects in the masks that have none; report how many, and the objects that stay without."""
-    placed = place_points(capture, missing, seed, reporter.check)
+    reporter.expect({PLACE: ("Preparing", _SECONDS_AN_OBJECT * len(missing))})
+    reporter.begin(PLACE, f"Placing points of {len(missing)} object{'' if len(missing) == 1 else 's'} without any")
+    placed = place_points(capture, missing, seed, reporter)
     for object_id in missing:
         count, named = int((placed.ids == object_id).sum()), object_name(capture, object_id)
         if count:

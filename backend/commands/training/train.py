@@ -52,7 +52,7 @@ from ..votes import VOTE, cast_votes, votes_are_current, votes_key
 from .follow import follow
 from .measuring import Measuring
 from .memory import warn_of_memory
-from .points import DENSE, starting_points
+from .points import DENSE, PLACE, starting_points
 
 PACE = "pace"
 """Name of the measurement of a step's time among the parts of a command."""
@@ -80,7 +80,8 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
     reporter.expect(
         {
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
-            DENSE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)), PACE: ("Preparing", 0.0),
+            DENSE: ("Preparing", 0.0), PLACE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
+            PACE: ("Preparing", 0.0),
             "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
