@@ -156,7 +156,9 @@ def test_photos_with_poses_are_imported_as_they_are(submitted, computed, shown, 
     job = imported()
     assert job.kind == "import" and job.folder == tmp_path / "user" / "trip"
     assert job.command[job.command.index("import") + 1] == str(computed) and "--max-size" not in job.command
-    assert shown == [{"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(computed)}]
+    (message,) = shown
+    assert message.pop("text").endswith(f"are in {computed} already, and are imported as they are.")
+    assert message == {"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(computed)}
     job.folder.mkdir()
     update_record(Reconstruction(job.folder), capture=CaptureRecord(str(computed), 800, "digest"))
     assert imported().command[-3:-1] == ["--max-size", "800"]
@@ -173,6 +175,7 @@ def test_new_poses_for_a_training_are_asked_about(submitted, computed, shown, tm
     bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"), cameras="one")
     assert not submitted
     (options,) = shown
+    assert "training of trip cannot go on with other poses" in options.pop("text")
     assert options.pop("label") == "Compute Poses Again" and options.pop("operator") == "objectgs.recompute_poses"
     bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", **options)
     (job,) = submitted
