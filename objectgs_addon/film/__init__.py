@@ -2,7 +2,14 @@
 """Film of a reconstruction: cameras, shots from Blender's camera and objects, and compositor nodes for the frames."""
 
 from .camera_path import make_path, new_camera
-from .compositing import has_frames, set_up_compositor, show_frames
+from .compositing import set_up_compositor, show_frames
 from .shot import ignored_settings, shot_of
 
-__all__ = ["has_frames", "ignored_settings", "make_path", "new_camera", "set_up_compositor", "shot_of", "show_frames"]
+__all__ = [
+    "ignored_settings",
+    "make_path",
+    "new_camera",
+    "set_up_compositor",
+    "shot_of",
+    "show_frames",
+]

@@ -19,11 +19,9 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
-from ..scene.kinds import KIND, RECONSTRUCTION, kind_of, mark
+from ..scene.kinds import FILM, KIND, RECONSTRUCTION, kind_of, mark
 from ..scene.shading.graph import Graph
-
-FILM = "film"
-"""Kind of the add-on's compositor nodes and of their image."""
+from ..scene.shading.render_settings import compositor_of, frames_node
 
 PATTERN = "splats.{:04d}.exr"
 _FRAMES = "objectgs_frames"
@@ -55,7 +53,7 @@ def set_up_compositor(
     if not frames:
         raise InputError(f"{folder} contains no film frames; render them first.")
     tree = _tree(scene)
-    node = _image_node(tree)
+    node = frames_node(tree)
     if node is None:
         _join(scene, view_layer, tree, _load(folder, frames), matte)
     elif (former := _path(node.image).parent) != folder and not _shows_elsewhere(scene, former):
@@ -71,22 +69,16 @@ def set_up_compositor(
 
 def _shows_elsewhere(scene: bpy.types.Scene, folder: Path) -> bool:
     """Return whether the compositor of another scene, which scenes may share, shows frames of a folder."""
-    own = _tree_if_any(scene)
-    trees = (_tree_if_any(other) for other in bpy.data.scenes if other != scene)
-    nodes = (_image_node(tree) for tree in trees if tree is not None and tree != own)
+    own = compositor_of(scene)
+    trees = (compositor_of(other) for other in bpy.data.scenes if other != scene)
+    nodes = (frames_node(tree) for tree in trees if tree != own)
     return any(node is not None and _path(node.image).parent == folder for node in nodes)
-
-
-def has_frames(scene: bpy.types.Scene) -> bool:
-    """Return whether the scene's compositor shows film frames."""
-    tree = _tree_if_any(scene)
-    return tree is not None and _image_node(tree) is not None
 
 
 def show_frames(scene: bpy.types.Scene, folder: Path) -> None:
     """Update the compositor to the current frames of `folder` if it shows frames of this folder."""
-    tree = _tree_if_any(scene)
-    node = _image_node(tree) if tree is not None else None
+    tree = compositor_of(scene)
+    node = frames_node(tree)
     frames = _frames_in(folder)
     if node is not None and frames and _path(node.image).parent == folder:
         _use(tree, folder, frames)
@@ -96,10 +88,6 @@ def _frames_in(folder: Path) -> list[int]:
     """Return the frame numbers in a folder, ascending."""
     words = [path.name.split(".") for path in folder.glob("splats.*.exr")]
     return sorted(int(word[1]) for word in words if len(word) == 3 and word[1].isdecimal())
-
-
-def _tree_if_any(scene: bpy.types.Scene) -> Any:
-    return scene.compositing_node_group if hasattr(scene, "compositing_node_group") else scene.node_tree
 
 
 def _tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
@@ -112,10 +100,6 @@ def _tree(scene: bpy.types.Scene) -> bpy.types.NodeTree:
         tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositor", "CompositorNodeTree")
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
     return tree
-
-
-def _image_node(tree: bpy.types.NodeTree) -> Any:
-    return next((node for node in tree.nodes if node.get(KIND) == FILM and node.type == "IMAGE"), None)
 
 
 def _load(folder: Path, frames: list[int]) -> bpy.types.Image:

@@ -19,7 +19,7 @@ class RenderPanel(WithReconstruction, bpy.types.Panel):
         layout = self.layout
         owner = context.scene
         root = owner.objectgs.active
-        for problem in (scene.render_problem(owner, root), scene.camera_problem(owner, root)):
+        for problem in (scene.render_problem(owner, root), *scene.scene_problems(owner, root)):
             if problem is not None:
                 write(layout, problem, "ERROR")
         layout.operator("objectgs.set_up_render", icon="SCENE")

@@ -60,7 +60,14 @@ from .orientation import orient_to_ground, scale_to_distance
 from .points import color_points_by, point_numbers, shown_points
 from .result import Shown, result_is_newer, show_label, show_objects, show_result
 from .shading.materials import SHADINGS
-from .shading.render_settings import camera_problem, is_untouched, prepare_render, render_problem, set_up_render
+from .shading.render_settings import (
+    has_frames,
+    is_untouched,
+    prepare_render,
+    render_problem,
+    scene_problems,
+    set_up_render,
+)
 from .splats import blur_of, splat_keys
 from .uncertain_cameras import uncertain_cameras
 
@@ -77,7 +84,6 @@ __all__ = [
     "blur_of",
     "bounds",
     "box_of",
-    "camera_problem",
     "capture_to_world",
     "collection_of",
     "color_points_by",
@@ -91,6 +97,7 @@ __all__ = [
     "floating_splats",
     "folder_of",
     "from_stored",
+    "has_frames",
     "has_shown_meshes",
     "hidden_splats",
     "is_in_file",
@@ -126,6 +133,7 @@ __all__ = [
     "root_of",
     "scale_to_distance",
     "scene_meshes",
+    "scene_problems",
     "select_splats",
     "selected_splats",
     "set_up_render",

@@ -33,6 +33,7 @@ SPLATS = "splats"
 ANCHORS = "anchors"
 MESH = "mesh"
 CROP_BOX = "crop_box"
+FILM = "film"  # The compositor nodes that read film frames, and their image.
 
 SPLATS_MATERIAL = "splats_material"
 MESH_MATERIAL = "mesh_material"

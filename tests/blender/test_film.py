@@ -606,9 +606,9 @@ def test_compositor_setup_is_idempotent(shot_blend, filmed, tmp_path):
     root = next(child for child in scene.collection.children_recursive if kinds.kind_of(child) == "reconstruction")
     with pytest.raises(InputError, match="no film frames"):
         film.set_up_compositor(scene, layer, root, filmed.parent)
-    assert not film.has_frames(scene) or bpy.app.version < (5, 0)
+    assert not blender_scene.has_frames(scene) or bpy.app.version < (5, 0)
     film.set_up_compositor(scene, layer, root, filmed)
-    assert film.has_frames(scene) and root.hide_render and scene.render.film_transparent and layer.use_pass_z
+    assert blender_scene.has_frames(scene) and root.hide_render and scene.render.film_transparent and layer.use_pass_z
     tree = scene.compositing_node_group if bpy.app.version >= (5, 0) else scene.node_tree
     nodes = [node.name for node in tree.nodes]
     images = len(bpy.data.images)
@@ -720,7 +720,7 @@ def test_film_operators_use_panel_settings(shot_blend, backend_python, registere
     (frame,) = read_shot(tmp_path / "frames" / "shot.json").frames
     assert frame.number == 7 and len(frame.samples) == 3
     assert [path.name for path in (tmp_path / "frames").glob("*.exr")] == ["splats.0007.exr"]
-    assert bpy.ops.objectgs.set_up_compositor() == {"FINISHED"} and film.has_frames(scene) and root.hide_render
+    assert bpy.ops.objectgs.set_up_compositor() == {"FINISHED"} and blender_scene.has_frames(scene) and root.hide_render
     camera.data.type = "ORTHO"
     with pytest.raises(RuntimeError, match="orthographic"):
         bpy.ops.objectgs.film_frames()

@@ -169,9 +169,10 @@ def test_problems_of_render_settings_are_named(shown):
     scene = bpy.context.scene
     assert "view transform AgX" in blender_scene.render_problem(scene, shown)
     scene.camera.data.type = "ORTHO"
-    assert "is orthographic" in blender_scene.camera_problem(scene, shown)
+    (problem,) = blender_scene.scene_problems(scene, shown)
+    assert "is orthographic" in problem
     scene.camera.data.type = "PERSP"
-    assert blender_scene.camera_problem(scene, shown) is None
+    assert not blender_scene.scene_problems(scene, shown)
     scene.view_settings.view_transform = "Standard"
     assert blender_scene.render_problem(scene, shown) is None
     scene.render.engine = "CYCLES"
@@ -184,6 +185,51 @@ def test_problems_of_render_settings_are_named(shown):
     scene.view_settings.view_transform = "Filmic"
     shown.hide_render = True
     assert blender_scene.render_problem(scene, shown) is None, "it is not rendered"
+
+
+def test_problems_of_composites_of_film_frames_are_named(shown):
+    scene = bpy.context.scene
+    if hasattr(scene, "compositing_node_group"):
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("mine", "CompositorNodeTree")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+    shown.hide_render = True
+    assert blender_scene.render_problem(scene, shown) is None
+    kinds.mark(tree.nodes.new("CompositorNodeImage"), kinds.FILM)
+    assert "view transform AgX" in blender_scene.render_problem(scene, shown)
+    camera, scene.camera = scene.camera, None
+    assert "no camera" in blender_scene.render_problem(scene, shown)
+    scene.camera, scene.view_settings.view_transform = camera, "Standard"
+    scene.render.engine = "CYCLES"
+    assert blender_scene.render_problem(scene, shown) is None, "film frames need no bounces"
+
+
+def test_moved_instances_of_splats_are_named(shown):
+    scene = bpy.context.scene
+    instance = bpy.data.objects.new("second", None)
+    instance.instance_type = "COLLECTION"
+    instance.instance_collection = next(
+        each for each in shown.children_recursive if kinds.part_of(each, kinds.SPLATS) is not None
+    )
+    scene.collection.objects.link(instance)
+    bpy.context.view_layer.update()
+    assert not blender_scene.scene_problems(scene, shown), "its splats are seen from the same side"
+    instance.location.x = 1
+    bpy.context.view_layer.update()
+    (problem,) = blender_scene.scene_problems(scene, shown)
+    assert problem.startswith("second is an instance")
+    instance.hide_render = True
+    assert not blender_scene.scene_problems(scene, shown)
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 0), reason="older versions render in one space")
+def test_other_working_spaces_are_named(shown):
+    bpy.ops.wm.set_working_color_space(working_space="ACEScg")
+    (problem,) = blender_scene.scene_problems(bpy.context.scene, shown)
+    assert "working space ACEScg" in problem
+    bpy.ops.wm.set_working_color_space(working_space="Linear Rec.709")
+    assert not blender_scene.scene_problems(bpy.context.scene, shown)
 
 
 def test_set_up_render_uses_selected_camera_of_capture(fresh, folder):

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import bpy
+from mathutils import Matrix
 
 from ....backend.shared.errors import InputError
 from ..cameras import use_camera, use_size
-from ..kinds import CAMERA, capture_of, kind_of
+from ..kinds import CAMERA, FILM, KIND, SPLATS, capture_of, kind_of
 
 VIEW_TRANSFORM = "Standard"
 BOUNCES = 1024
@@ -17,6 +20,12 @@ FEWEST_BOUNCES = 64
 
 SAMPLES = 256
 """Samples in Cycles in place of Blender's default, which is for light that bounces; splats emit theirs."""
+
+WORKING_SPACE = "Linear Rec.709"
+"""Color space of the splats' linear colors, which Blender takes for colors of its working space."""
+
+SAME_PLACE = 1e-5
+"""Largest difference between the matrices of instances and originals at the same place."""
 
 _STARTUP_OBJECTS = {"Camera", "Cube", "Light"}
 _STARTUP_VIEW = ("AgX", "None", 0.0, 1.0)
@@ -77,26 +86,62 @@ def set_up_render(
 
 
 def render_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | None:
-    """Return a sentence about what is wrong with the settings for renders of a reconstruction; None if nothing is."""
-    if root.hide_render:
+    """Return a sentence about settings that `set_up_render` corrects for renders of a reconstruction; None if none is.
+
+    Renders show a reconstruction that is hidden in them where the compositor shows its film frames.
+    """
+    if root.hide_render and not has_frames(scene):
         return None
     if scene.camera is None:
         return "The scene has no camera."
     transform = scene.view_settings.view_transform
     if transform != VIEW_TRANSFORM:
         return f"The view transform {transform} changes the colors of the photos."
-    if scene.render.engine == "CYCLES" and scene.cycles.transparent_max_bounces < FEWEST_BOUNCES:
+    if (
+        not root.hide_render
+        and scene.render.engine == "CYCLES"
+        and scene.cycles.transparent_max_bounces < FEWEST_BOUNCES
+    ):
         count = scene.cycles.transparent_max_bounces
         return f"Rays pass through at most {count} splats, which leaves black fringes."
     return None
 
 
-def camera_problem(scene: bpy.types.Scene, root: bpy.types.Collection) -> str | None:
-    """Return a sentence about a camera through which a reconstruction is rendered wrongly; None if there is none."""
-    camera = scene.camera
-    if root.hide_render or camera is None or camera.type != "CAMERA" or camera.data.type != "ORTHO":
-        return None
-    return f"{camera.name} is orthographic, for which splats are too narrow; set its Type to Perspective."
+def scene_problems(scene: bpy.types.Scene, root: bpy.types.Collection) -> list[str]:
+    """Return sentences about what makes Blender render a reconstruction wrongly and `set_up_render` does not change."""
+    if root.hide_render:
+        return []
+    found = []
+    camera, instance = scene.camera, _moved_instance(scene)
+    if camera is not None and camera.type == "CAMERA" and camera.data.type == "ORTHO":
+        found.append(f"{camera.name} is orthographic, for which splats are too narrow; set its Type to Perspective.")
+    if instance is not None:
+        found.append(
+            f"{instance.name} is an instance, whose splats F12 turns wrongly; use Object > Apply > "
+            "Make Instances Real, or film frames."
+        )
+    if hasattr(bpy.data, "colorspace") and bpy.data.colorspace.working_space != WORKING_SPACE:  # Blender 5.0 and newer
+        found.append(
+            f"The working space {bpy.data.colorspace.working_space} changes the colors of splats; set it to "
+            f"{WORKING_SPACE} in Render Properties > Color Management."
+        )
+    return found
+
+
+def compositor_of(scene: bpy.types.Scene) -> Any:
+    """Return the scene's compositor node tree, or None."""
+    return scene.compositing_node_group if hasattr(scene, "compositing_node_group") else scene.node_tree
+
+
+def frames_node(tree: Any) -> Any:
+    """Return the node of a compositor node tree that reads film frames; None without it, or without a tree."""
+    nodes = tree.nodes if tree is not None else ()
+    return next((node for node in nodes if node.get(KIND) == FILM and node.type == "IMAGE"), None)
+
+
+def has_frames(scene: bpy.types.Scene) -> bool:
+    """Return whether the scene's compositor shows film frames."""
+    return frames_node(compositor_of(scene)) is not None
 
 
 def is_untouched(scene: bpy.types.Scene) -> bool:
@@ -118,3 +163,22 @@ def _cameras(root: bpy.types.Collection) -> list[bpy.types.Object]:
     capture = capture_of(root)
     cameras = [obj for obj in capture.objects if kind_of(obj) == CAMERA] if capture is not None else []
     return sorted(cameras, key=lambda obj: obj["objectgs_image"])
+
+
+def _moved_instance(scene: bpy.types.Scene) -> bpy.types.Object | None:
+    """Return an instance of a collection with splats at another place than theirs, or None.
+
+    Modifiers, which turn splats to the camera, run at the place of the original.
+    """
+    have_splats: dict[bpy.types.Collection, bool] = {}
+    for obj in scene.objects:
+        collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+        if collection is None or obj.hide_render:
+            continue
+        if collection not in have_splats:
+            have_splats[collection] = any(kind_of(part) == SPLATS for part in collection.all_objects)
+        if have_splats[collection]:
+            moved = obj.matrix_world @ Matrix.Translation(-collection.instance_offset) - Matrix.Identity(4)
+            if max(abs(value) for row in moved for value in row) > SAME_PLACE:
+                return obj
+    return None
