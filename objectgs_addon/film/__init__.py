@@ -3,12 +3,13 @@
 
 from .camera_path import make_path, new_camera
 from .compositing import set_up_compositor, show_frames
-from .shot import ignored_settings, shot_of
+from .shot import ignored_settings, rendered_twice, shot_of
 
 __all__ = [
     "ignored_settings",
     "make_path",
     "new_camera",
+    "rendered_twice",
     "set_up_compositor",
     "shot_of",
     "show_frames",

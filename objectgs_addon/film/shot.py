@@ -2,8 +2,9 @@
 """Sampling of a scene's camera and a reconstruction's objects over time as a shot in capture coordinates.
 
 A shot contains the splats that Blender would render: those of every object whose collections, pivot and parts are not
-hidden in renders. The reconstruction's own collection may be hidden, since the compositor combines film frames with
-Blender's rendering without the reconstruction. An object not moved in Blender keeps its transform from objects.json.
+hidden in renders or from the camera. The reconstruction's own collection may be hidden, since the compositor combines
+film frames with Blender's rendering without the reconstruction. An object not moved in Blender keeps its transform from
+objects.json.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ TOLERANCE = 2e-6
 """Tolerance, relative to the scene size, up to which an object counts as not moved, since Blender stores float32."""
 
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+_MOST_NAMES = 5
 _UNSUPPORTED = {"ORTHO": "orthographic", "PANO": "panoramic"}
 
 
@@ -67,7 +69,7 @@ def shot_of(
         raise InputError("The scene's frame range is empty; set its start and end.")
     if frames[0] < 0:
         raise InputError("The first frame is below 0, but image sequences have no negative numbers; move the shot.")
-    instances = _instances_of(scene, view_layer, root)
+    instances = _instances_of(scene, root, _paths(view_layer, root))
     before = scene.frame_current, scene.frame_subframe
     has_markers = any(marker.camera is not None for marker in scene.timeline_markers)
     made, scale = [], None
@@ -105,7 +107,39 @@ def ignored_settings(scene: bpy.types.Scene, camera: bpy.types.Object | None = N
     found = [f"the depth of field of {name}" for name in sorted(blurred)]
     if render.use_border and render.use_crop_to_border:
         found.append("Crop to Render Region")
-    return f"Film frames of splats are rendered without {' and '.join(found)}." if found else None
+    if render.use_multiview:
+        found.append("Stereoscopy")
+    if _has_holdouts(scene):
+        found.append("Holdout")
+    words = [", ".join(found[:-1]), *found[-1:]]
+    return f"Film frames of splats are rendered without {' and '.join(filter(None, words))}." if found else None
+
+
+def rendered_twice(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> str | None:
+    """Return a sentence about what renders show of a hidden reconstruction beside its film frames; None for nothing.
+
+    Instances and collections outside the reconstruction's are not hidden with it.
+    """
+    names = {
+        (instance.instancer or instance.pivot).name
+        for instance in _instances_of(scene, root, _paths(view_layer))
+        if instance.is_seen() and not (instance.instancer and _contains(instance.instancer.instance_collection, root))
+    }
+    if not names:
+        return None
+    some = ", ".join(sorted(names)[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
+    return f"Renders show these twice, since they are outside the collection {root.name}: {some}; move them into it."
+
+
+def _has_holdouts(scene: bpy.types.Scene) -> bool:
+    layers = (path[-1] for view_layer in scene.view_layers for paths in _paths(view_layer).values() for path in paths)
+    return any(obj.is_holdout and not obj.hide_render for obj in scene.objects) or any(
+        layer.holdout and not layer.exclude for layer in layers
+    )
+
+
+def _contains(collection: bpy.types.Collection, other: bpy.types.Collection) -> bool:
+    return other == collection or other in collection.children_recursive
 
 
 @dataclass(frozen=True)
@@ -191,13 +225,12 @@ class _SplatsInstance:
     def is_seen(self) -> bool:
         """Return whether Blender renders it at the current frame, ignoring the reconstruction's own collection."""
         top = self.instancer or self.pivot
-        shown = any(not part.hide_render for part in self.parts)
+        shown = any(not part.hide_render and part.visible_camera for part in self.parts)
         return (
             shown
             and not top.hide_render
-            and any(
-                all(not layer.exclude and not layer.collection.hide_render for layer in path) for path in self.paths
-            )
+            and top.visible_camera
+            and any(all(map(_is_shown, path)) for path in self.paths)
         )
 
     def world(self) -> np.ndarray:
@@ -207,6 +240,10 @@ class _SplatsInstance:
             offset = Matrix.Translation(-self.instancer.instance_collection.instance_offset)
             world = _world_of(self.instancer) @ offset @ world
         return np.array(world, np.float64)
+
+
+def _is_shown(layer: bpy.types.LayerCollection) -> bool:
+    return not (layer.exclude or layer.indirect_only or layer.collection.hide_render)
 
 
 def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstance]) -> None:
@@ -229,9 +266,9 @@ def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstanc
 
 
 def _instances_of(
-    scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection
+    scene: bpy.types.Scene, root: bpy.types.Collection, paths: dict[bpy.types.Collection, list]
 ) -> list[_SplatsInstance]:
-    paths = _paths(view_layer, root)
+    """Return the splat carriers of a reconstruction, and their instances; paths: those of `_paths`."""
     parent, members = parent_of(root), {root, *root.children_recursive}
 
     def is_ours(obj: bpy.types.Object) -> bool:
@@ -277,12 +314,12 @@ def _instance_of(obj: bpy.types.Object, paths: Any, whole: tuple, instancer: Any
     return _SplatsInstance(object_id, obj, pivot, (obj, *meshes), tuple(of_top), instancer)
 
 
-def _paths(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict:
-    """Map collections to their paths in a view layer: lists of layer collections from the top, without the root's."""
+def _paths(view_layer: bpy.types.ViewLayer, without: bpy.types.Collection | None = None) -> dict:
+    """Map collections to their paths in a view layer: lists of layer collections from the top, without one of them."""
     found: dict = {}
 
     def walk(layer: Any, path: list) -> None:
-        if layer.collection != root:
+        if layer.collection != without:
             path = [*path, layer]
         found.setdefault(layer.collection, []).append(path)
         for child in layer.children:

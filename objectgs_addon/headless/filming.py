@@ -67,6 +67,12 @@ def film(options: argparse.Namespace) -> None:
     )
     if options.composite or options.save:
         filming.set_up_compositor(target, target.view_layers[0], root, out)
+        for problem in (
+            filming.rendered_twice(target, target.view_layers[0], root),
+            scene.render_problem(target, root),
+        ):
+            if problem is not None:
+                reporter.warning(problem)
     if options.save:
         save_blend(absolute(options.save), reporter)
     if options.composite:

@@ -16,7 +16,8 @@ class SetUpCompositor(UsesOutputFolder, bpy.types.Operator):
     bl_label = "Set Up Compositor"
     bl_description = (
         "Combine the film frames with Blender's rendering by depth, with mattes of objects. The "
-        "reconstruction itself is hidden in renders, so that it does not appear twice"
+        "reconstruction itself is hidden in renders, so that it does not appear twice; Film > Transparent and the "
+        "pass Z are switched on"
     )
     bl_options = {"REGISTER", "UNDO"}
 
@@ -38,8 +39,12 @@ class SetUpCompositor(UsesOutputFolder, bpy.types.Operator):
         )
         self.report(
             {"INFO"},
-            f"Renders show the film frames of {root.name}; its splats and meshes in Blender are hidden in renders",
+            f"Renders show the film frames of {root.name} instead of its splats and meshes; Film > Transparent and the "
+            "pass Z are on",
         )
+        for problem in (film.rendered_twice(owner, context.view_layer, root), scene.render_problem(owner, root)):
+            if problem is not None:
+                self.report({"WARNING"}, problem)
 
 
 CLASSES = (SetUpCompositor,)

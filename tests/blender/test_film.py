@@ -318,6 +318,48 @@ def test_settings_that_films_ignore_are_named(root):
     assert "depth of field of Film" in film.ignored_settings(scene)
     scene.render.use_border = scene.render.use_crop_to_border = True
     assert "and Crop to Render Region" in film.ignored_settings(scene)
+    scene.render.use_multiview = True
+    splats = splats_of(root, 1)
+    splats.is_holdout = True
+    assert film.ignored_settings(scene).endswith(" Film, Crop to Render Region, Stereoscopy and Holdout.")
+    splats.is_holdout = False
+    bpy.context.view_layer.layer_collection.children[root.name].holdout = True
+    assert "Holdout" in film.ignored_settings(scene)
+
+
+@pytest.mark.parametrize("way", ["camera", "indirect"])
+def test_what_the_camera_does_not_see_is_left_out(root, way):
+    (sample,) = shoot(root).frames[0].samples
+    assert 1 in sample.objects
+    collection = blender_scene.object_collections(root)[1]
+    if way == "camera":
+        for part in collection.objects:
+            part.visible_camera = False
+    else:
+        layer = bpy.context.view_layer.layer_collection.children[root.name]
+        layer.children[collection.name].indirect_only = True
+    (sample,) = shoot(root).frames[0].samples
+    assert 1 not in sample.objects and 2 in sample.objects
+
+
+def test_what_renders_show_beside_film_frames_is_named(root):
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    root.hide_render = True
+    assert film.rendered_twice(scene, layer, root) is None
+    first, second = (blender_scene.object_collections(root)[each] for each in (1, 2))
+    scene.collection.children.link(first)
+    for name, collection, owner in (
+        ("outside", second, scene.collection),
+        ("inside", second, root),
+        ("whole", root, scene.collection),
+    ):
+        instance = bpy.data.objects.new(name, None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", collection
+        owner.objects.link(instance)
+    assert f" table top: {ensure_pivot(root, 1).name}, outside; " in film.rendered_twice(scene, layer, root)
+    bpy.data.objects["outside"].hide_render = True
+    scene.collection.children.unlink(first)
+    assert film.rendered_twice(scene, layer, root) is None
 
 
 def test_hidden_camera_follows_its_constraints(root):
@@ -686,6 +728,21 @@ def registered():
     extension.register()
     yield
     extension.unregister()
+
+
+def test_compositor_operator_says_what_it_changes_and_what_is_wrong(root, registered, monkeypatch, capfd):
+    scene = bpy.context.scene
+    scene.objectgs.active = root
+    bpy.ops.objectgs.use_folder()
+    instance = bpy.data.objects.new("second", None)
+    instance.instance_type, instance.instance_collection = "COLLECTION", blender_scene.object_collections(root)[1]
+    scene.collection.objects.link(instance)
+    monkeypatch.setattr(film, "set_up_compositor", lambda *_: None)
+    monkeypatch.setattr(blender_scene, "render_problem", lambda *_: "The colors change.")
+    assert bpy.ops.objectgs.set_up_compositor() == {"FINISHED"}
+    printed = capfd.readouterr().out
+    assert "Film > Transparent and the pass Z are on" in printed
+    assert "Warning: Renders show these twice" in printed and "Warning: The colors change." in printed
 
 
 @pytest.mark.long
