@@ -220,10 +220,12 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     object_ids = _object_ids(table[OBJECT_ID], warnings) if has_ids else np.zeros(n, np.int64)
     unobserved = unobserved_of(table)
 
+    # Opaque, invisible and flat splats of other programs may have infinite logits and logarithms.
+    opacities, scales = np.clip(opacities, -80, 80), np.maximum(scales, math.log(SMALLEST_SCALE))
     keep = _usable(means, quats, scales, opacities, sh)
     with np.errstate(over="ignore"):
-        scales = np.exp(np.maximum(scales, math.log(SMALLEST_SCALE)))
-    opacities = 1.0 / (1.0 + np.exp(-np.clip(opacities, -80, 80)))
+        scales = np.exp(scales)
+    opacities = 1.0 / (1.0 + np.exp(-opacities))
     read = Splats(means, quats, scales, opacities, sh, object_ids, unobserved, read_blur(path))
     splats, dropped = cleaned(path, read, keep)
     return splats, warnings + dropped

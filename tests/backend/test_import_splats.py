@@ -171,6 +171,15 @@ def test_bad_files_are_refused(run_command, tmp_path, what):
     assert not (tmp_path / "new").exists()
 
 
+def test_refused_splats_are_explained(run_command, tmp_path):
+    splats = some_splats(n=1)
+    write_splats(tmp_path / "a.ply", splats)
+    data = (tmp_path / "a.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(data.replace(splats.means.tobytes()[:4], np.float32(np.nan).tobytes()))
+    result = run_command("import-splats", tmp_path / "a.ply", "--out", tmp_path / "out")
+    assert_rejected(result, "contains no splats", "1 of 1 splats in a.ply were dropped")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no such files")
 @pytest.mark.parametrize("name", ["a.spz", "a.splat"])
 def test_special_files_are_refused(run_command, tmp_path, name):

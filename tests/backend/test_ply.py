@@ -272,6 +272,13 @@ def test_nonfinite_rows_are_dropped_with_warning(tmp_path, bad):
     assert all(np.isfinite(getattr(splats, name)).all() for name in ("means", "quats", "scales", "opacities", "sh"))
 
 
+def test_infinite_logits_and_flat_axes_are_kept(tmp_path):
+    rows = [{"opacity": np.inf}, {"opacity": -np.inf}, {"scale_2": -np.inf}]
+    splats, warnings = read_splats(minimal(tmp_path / "a.ply", *rows))
+    assert warnings == [] and splats.opacities == pytest.approx([1, 0, 0.5], abs=2e-7)
+    assert splats.scales[2] == pytest.approx([1, np.exp(-1), 0]) and splats.scales[2, 2] > 0
+
+
 def test_truncated_file_is_reported(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(n=10))
     data = (tmp_path / "a.ply").read_bytes()

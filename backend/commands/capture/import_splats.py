@@ -39,7 +39,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     reporter.begin("splats", f"Reading {options.splats.name}")
     splats, warnings = read_foreign_splats(options.splats)
     if len(splats) == 0:
-        raise InputError(f"{options.splats} contains no splats.")
+        raise InputError(" ".join([f"{options.splats} contains no splats.", *warnings]))
     if options.splats.suffix.lower() == ".spz":
         splats = transformed(splats, DOWN_TO_UP)
     for sentence in warnings:
