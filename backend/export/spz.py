@@ -19,7 +19,7 @@ from ..model.splats import Splats
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
-from ..shared.splats.blending import USUAL_EPS_2D
+from ..shared.splats.blending import EPS_2D, USUAL_EPS_2D
 from .ply import cleaned, rounding_warnings
 
 DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -37,6 +37,8 @@ _LARGEST_LOG = _SMALLEST_LOG + 255 / _SCALE_STEP
 _MOST_SPLATS = 10_000_000
 """Number of splats that Niantic's own reader accepts at most; it limits what a small file can expand to."""
 _MOST_BITS, _HIGHEST_DEGREE, _DEGREE_KEPT = 24, 4, 3
+_ANTIALIASED = 1
+"""Flag of splats that were trained with antialiasing."""
 
 
 def write_spz(path: Path, splats: Splats) -> list[str]:
@@ -125,7 +127,7 @@ def read_spz(path: Path) -> tuple[Splats, list[str]]:
     Raises:
         InputError: The file cannot be read, is damaged, or has another version.
     """
-    count, degree, bits, version, data = _unpack(path)
+    count, degree, bits, flags, version, data = _unpack(path)
     quat_size = 3 if version == 2 else 4
     rest = (degree + 1) ** 2 - 1
     sections, at = [], _HEADER.size
@@ -143,16 +145,16 @@ def read_spz(path: Path) -> tuple[Splats, list[str]]:
     sh[:, 1:] = (others.reshape(count, rest, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
     quats = _three_components(rotations) if version == 2 else _smallest_three(rotations)
     logs = scales / _SCALE_STEP + _SMALLEST_LOG
-    ids = np.zeros(count, np.int64)
-    read = Splats(means, quats, np.exp(logs), alphas[:, 0] / 255.0, sh, ids, blur=USUAL_EPS_2D)
+    ids, blur = np.zeros(count, np.int64), EPS_2D if flags & _ANTIALIASED else USUAL_EPS_2D
+    read = Splats(means, quats, np.exp(logs), alphas[:, 0] / 255.0, sh, ids, blur=blur)
     splats, warnings = cleaned(path, read)
     if degree > _DEGREE_KEPT:
         warnings.append(f"{path.name} has spherical harmonics of degree {degree}, of which {_DEGREE_KEPT} are kept.")
     return splats, warnings
 
 
-def _unpack(path: Path) -> tuple[int, int, int, int, bytes]:
-    """Return the number of splats, degree, fractional bits and version of an SPZ file, and its uncompressed bytes."""
+def _unpack(path: Path) -> tuple[int, int, int, int, int, bytes]:
+    """Return the number of splats, degree, fractional bits, flags and version of an SPZ file, and its plain bytes."""
     try:
         packed = read_regular(path)
     except OSError as error:
@@ -164,7 +166,7 @@ def _unpack(path: Path) -> tuple[int, int, int, int, bytes]:
         head = stream.decompress(packed, _HEADER.size)
         if len(head) < _HEADER.size or _HEADER.unpack(head)[0] != MAGIC:
             raise InputError(f"{path} is not an SPZ file; export it again as SPZ or PLY.")
-        _, version, count, degree, bits, _, _ = _HEADER.unpack(head)
+        _, version, count, degree, bits, flags, _ = _HEADER.unpack(head)
         if version not in _READABLE:
             raise _other_version(path, version)
         if degree > _HIGHEST_DEGREE or bits > _MOST_BITS:
@@ -177,7 +179,7 @@ def _unpack(path: Path) -> tuple[int, int, int, int, bytes]:
         raise InputError(f"{path} is damaged or not an SPZ file ({error}); export it again as SPZ or PLY.") from error
     if len(body) < size:
         raise InputError(f"{path} is truncated: it declares {count} splats but ends before them; export it again.")
-    return count, degree, bits, version, head + body
+    return count, degree, bits, flags, version, head + body
 
 
 def _other_version(path: Path, version: int) -> InputError:

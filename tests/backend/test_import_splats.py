@@ -21,9 +21,9 @@ from .command_result import assert_rejected
 from .test_edit_export import assert_close, folder, read_spz, some_splats  # noqa: F401
 
 
-def spz(version=3, count=1, degree=0, bits=8, body=b"", magic=0x5053474E):
+def spz(version=3, count=1, degree=0, bits=8, body=b"", magic=0x5053474E, flags=0):
     """Return the bytes of an SPZ file."""
-    return gzip.compress(struct.pack("<IIIBBBB", magic, version, count, degree, bits, 0, 0) + body)
+    return gzip.compress(struct.pack("<IIIBBBB", magic, version, count, degree, bits, flags, 0) + body)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -76,6 +76,12 @@ def test_spz_positions_have_a_sign_and_fractional_bits(tmp_path):
     body = b"".join(value.to_bytes(3, "little", signed=True) for value in fixed) + bytes(2 + 6 + 6 + 8)
     (tmp_path / "a.spz").write_bytes(spz(count=2, bits=4, body=body))
     np.testing.assert_allclose(read_foreign_splats(tmp_path / "a.spz")[0].means.ravel(), np.array(fixed) / 16)
+
+
+@pytest.mark.parametrize(("flags", "blur"), [(0, USUAL_EPS_2D), (1, EPS_2D), (2, USUAL_EPS_2D), (3, EPS_2D)])
+def test_antialiased_spz_is_not_blurred_more(tmp_path, flags, blur):
+    (tmp_path / "a.spz").write_bytes(spz(body=bytes(20), flags=flags))
+    assert read_foreign_splats(tmp_path / "a.spz")[0].blur == blur
 
 
 def test_splat_round_trip(tmp_path):

@@ -12,7 +12,7 @@ from backend.export import read_splats, write_splat_parts, write_splats
 from backend.model.splats import Splats, concatenate
 from backend.shared.errors import InputError
 from backend.shared.formats.ply import read_vertices, write_vertices
-from backend.shared.splats.blending import USUAL_EPS_2D
+from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 
 
 def some_splats(n=5, degree=1, seed=0, dtype=np.float32):
@@ -233,6 +233,22 @@ def test_filter_is_that_of_the_file(tmp_path, comment, blur):
     write_splats(path, replace(some_splats(n=3), blur=0.05))
     path.write_bytes(path.read_bytes().replace(b"low_pass 0.05", f"low_pass {comment}".encode()))
     assert read_splats(path)[0].select([0, 2]).with_degree(0).blur == blur
+
+
+@pytest.mark.parametrize(
+    ("comment", "blur"),
+    [
+        ("antialiased 1", EPS_2D),
+        (" SplatRenderMode:  MIP ", EPS_2D),
+        ("antialiased 0", USUAL_EPS_2D),
+        ("SplatRenderMode: default", USUAL_EPS_2D),
+        ("SplatRenderMode: mip\ncomment low_pass 0.1", 0.1),
+    ],
+)
+def test_antialiased_splats_are_not_blurred_more(tmp_path, comment, blur):
+    path = minimal(tmp_path / "a.ply", {})
+    path.write_bytes(path.read_bytes().replace(b"made elsewhere", comment.encode()))
+    assert read_splats(path)[0].blur == blur
 
 
 def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..class_table import LARGEST_ID
 from ..errors import InputError
-from ..splats.blending import LEAST_EPS_2D, USUAL_EPS_2D
+from ..splats.blending import EPS_2D, LEAST_EPS_2D, USUAL_EPS_2D
 from .ply import read_comments, read_vertices
 
 MEANS = ("x", "y", "z")
@@ -39,6 +39,9 @@ LARGEST_SHOWN_LOG_SCALE = 80.0
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _REST = "f_rest_"
 _BLUR = "low_pass"
+_ANTIALIASED = ("antialiased 1", "splatrendermode: mip")
+"""Comments, in lower case, of Postshot and of Brush about splats that were trained with antialiasing."""
+
 REQUIRED = (*MEANS, *_DC, OPACITY, *SCALES, *QUATS)
 _ROWS_AT_ONCE = 1 << 14
 """Number of rows checked at a time, small enough to stay in the CPU cache."""
@@ -69,9 +72,11 @@ def blur_comment(variance: float) -> str:
 def read_blur(path: Path) -> float:
     """Return the variance of the low-pass filter of splats that `read_splat_table` has read.
 
-    It is that of 3D Gaussian splatting if the file does not say.
+    It is that of 3D Gaussian splatting if the file does not say. Splats that were trained with antialiasing look best
+    with that of this program, since what it adds to them is not taken from their opacity.
     """
-    for comment in read_comments(path):
+    comments = read_comments(path)
+    for comment in comments:
         name, _, value = comment.partition(" ")
         if name == _BLUR:
             try:
@@ -80,7 +85,7 @@ def read_blur(path: Path) -> float:
                 continue
             if LEAST_EPS_2D <= blur <= USUAL_EPS_2D:
                 return blur
-    return USUAL_EPS_2D
+    return EPS_2D if any(" ".join(text.lower().split()) in _ANTIALIASED for text in comments) else USUAL_EPS_2D
 
 
 def splat_dtype(names: Iterable[str], position: str = "f4") -> np.dtype:
