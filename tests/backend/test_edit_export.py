@@ -442,9 +442,16 @@ def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):
 
 def test_import_without_masks_keeps_ids_of_file(run_command, write_capture, folder, tmp_path):
     scene = write_capture(views=4, masks=False)
-    result = run_command("import-splats", folder.splats, "--out", tmp_path / "made2", "--capture", scene.folder)
+    splats = some_splats(n=len(scene.xyz))
+    splats.means = scene.xyz.astype(np.float32)
+    write_splats(tmp_path / "seen.ply", splats)
+    result = run_command("import-splats", tmp_path / "seen.ply", "--out", tmp_path / "made2", "--capture", scene.folder)
     assert result.code == EXIT_DONE and "masks does not exist" in result.err
     assert len(read_objects(tmp_path / "made2" / "objects.json")) == 4
+    splats.means += 1000
+    write_splats(tmp_path / "far.ply", splats)
+    result = run_command("import-splats", tmp_path / "far.ply", "--out", tmp_path / "made3", "--capture", scene.folder)
+    assert_rejected(result, "Only 0% of the splats", "coordinates")
 
 
 def test_failed_import_leaves_no_files(run_command, write_capture, folder, tmp_path):

@@ -12,9 +12,8 @@ from ...export import DOWN_TO_UP, read_foreign_splats, write_splats
 from ...labels import Votes
 from ...labels import vote as vote_points
 from ...labels.points import write_points
-from ...model.splats import Splats
+from ...labels.voting import find_visible_points
 from ...shared.errors import InputError
-from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.record import ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
@@ -25,6 +24,8 @@ from ..votes import VOTE, object_name
 
 _LEAST_VISIBLE = 0.5
 """Least fraction of the splats inside a view; with fewer, they are probably not in the capture's coordinates."""
+_MOST_CHECKED = 20_000
+"""Number of splats, evenly chosen, of which this fraction is measured."""
 
 
 def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -51,10 +52,12 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
             write_points(folder.points, _no_points(), _no_votes(0))
         else:
             capture = read_capture(folder, options, reporter)
+            _require_visible(capture, splats.means)
             names = {i: object_name(capture, i) for i in capture.object_ids.tolist()}
             votes = _no_votes(len(capture.points.xyz))
             if capture.has_masks:
-                splats.object_ids = _vote_on_splats(capture, splats, reporter)
+                reporter.begin(VOTE, "Voting on the objects of the splats")
+                splats.object_ids = vote_points(capture, reporter=reporter, positions=splats.means).ids
                 votes = vote_points(capture)
             else:
                 reporter.warning(f"{capture.folder / 'masks'} does not exist, so splats keep the objects of the file.")
@@ -68,16 +71,17 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     reporter.done(splats=len(splats), objects=objects, reconstruction=str(folder.folder))
 
 
-def _vote_on_splats(capture: Capture, splats: Splats, reporter: Reporter) -> np.ndarray:
-    """Return the voted object ID of each splat (N,); raise InputError if too few splats are in the capture's views."""
-    reporter.begin(VOTE, "Voting on the objects of the splats")
-    votes = vote_points(capture, reporter=reporter, positions=splats.means)
-    seen = float((votes.visible > 0).mean())
+def _require_visible(capture: Capture, centers: np.ndarray) -> None:
+    """Raise InputError if too few splats with centers (N, 3) are in the capture's views."""
+    some = np.ascontiguousarray(centers[:: -(-len(centers) // _MOST_CHECKED)].T, np.float64)
+    visible = np.zeros(some.shape[1], bool)
+    for index in range(len(capture.views)):
+        visible[find_visible_points(capture, some, index, None)[0]] = True
+    seen = float(visible.mean())
     if seen < _LEAST_VISIBLE:
         raise InputError(
             f"Only {seen:.0%} of the splats lie in the views of {capture.folder}; they must be in its coordinates."
         )
-    return votes.ids
 
 
 def _no_points() -> Points:
