@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.object_model import DISC_THICKNESS
 from ..model.splats import Splats, blocks, some_blocks
 from ..shared.class_table import LARGEST_ID
 from ..shared.formats.ply import write_vertex_blocks
@@ -37,6 +38,8 @@ OPACITY_MARGIN = 1e-7
 
 SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 FLOAT32_RELATIVE_ERROR = 2.0**-24
+DEGREE_KEPT = 3
+"""Highest degree of spherical harmonics that is read; higher ones are cut off."""
 
 
 def write_splats(
@@ -191,31 +194,32 @@ def rounding_warnings(path: Path, splats: Splats, step: float, advice: str | Non
 def read_splats(path: Path) -> tuple[Splats, list[str]]:
     """Read a PLY file of splats, written by this or another program.
 
-    Properties may have any order and number type; unknown ones are ignored. Without `object_id`, all IDs are 0.
-    Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again
+    Properties may have any order and number type; unknown ones are ignored. Without `object_id`, all IDs are 0, and
+    without `scale_2`, splats are discs. Of spherical harmonics, degree 3 is kept at most. Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again
     produces the same file.
 
     Args:
         path: The file to read.
 
     Returns:
-        The splats, except those with NaN, Inf or a zero quaternion, and warnings about these.
+        The splats, except those with NaN, Inf or a zero quaternion, and warnings about these and about what is lost.
 
     Raises:
         InputError: The file is missing, truncated, ASCII, or not a PLY of splats.
     """
     path = Path(path)
-    table = read_splat_table(path)
+    table = read_splat_table(path, foreign=True)
     n = len(table)
     means = _columns(table, MEANS)
     quats = _columns(table, QUATS)
-    scales = _columns(table, SCALES).astype(np.float64)
+    scales = _log_scales(table)
     opacities = table[OPACITY].astype(np.float64)
-    sh = np.empty((n, coefficients_of(table), 3), np.float32)
-    for k, names in enumerate(sh_names(sh.shape[1])):
+    coefficients = coefficients_of(table)
+    sh = np.empty((n, min(coefficients, (DEGREE_KEPT + 1) ** 2), 3), np.float32)
+    for k, names in enumerate(sh_names(coefficients)[: sh.shape[1]]):
         for channel, name in enumerate(names):
             sh[:, k, channel] = table[name]
-    warnings: list[str] = []
+    warnings = degree_warnings(path, math.isqrt(coefficients) - 1)
     has_ids = OBJECT_ID in (table.dtype.names or ())
     object_ids = _object_ids(table[OBJECT_ID], warnings) if has_ids else np.zeros(n, np.int64)
     unobserved = unobserved_of(table)
@@ -259,6 +263,21 @@ def cleaned(path: Path, splats: Splats, keep: NDArray | None = None) -> tuple[Sp
     splats.scales = np.maximum(splats.scales, SMALLEST_SCALE)
     splats.opacities = np.clip(splats.opacities, OPACITY_MARGIN, 1.0 - OPACITY_MARGIN)
     return splats, warnings
+
+
+def degree_warnings(path: Path, degree: int) -> list[str]:
+    """Return a warning if a file has spherical harmonics of a higher degree than is kept."""
+    if degree <= DEGREE_KEPT:
+        return []
+    return [f"{path.name} has spherical harmonics of degree {degree}, of which {DEGREE_KEPT} are kept."]
+
+
+def _log_scales(table: NDArray) -> NDArray[np.float64]:
+    """Return the logarithms of the scales (N, 3), the third of which a file of discs does not have."""
+    if SCALES[2] in (table.dtype.names or ()):
+        return _columns(table, SCALES).astype(np.float64)
+    wide = _columns(table, SCALES[:2]).astype(np.float64)
+    return np.column_stack([wide, wide.min(1) + math.log(DISC_THICKNESS)])
 
 
 def _columns(table: NDArray, names: tuple[str, ...]) -> NDArray:

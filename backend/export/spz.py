@@ -20,7 +20,7 @@ from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
 from ..shared.formats.regular_file import read_regular
 from ..shared.splats.blending import EPS_2D, USUAL_EPS_2D
-from .ply import cleaned, rounding_warnings
+from .ply import DEGREE_KEPT, cleaned, degree_warnings, rounding_warnings
 
 DOWN_TO_UP = np.diag([1.0, -1.0, -1.0, 1.0])
 """From the axes of COLMAP (x right, y down, z forward) to those of SPZ (x right, y up, z back), and back."""
@@ -36,7 +36,7 @@ _SCALE_STEP, _SMALLEST_LOG = 16.0, -10.0
 _LARGEST_LOG = _SMALLEST_LOG + 255 / _SCALE_STEP
 _MOST_SPLATS = 10_000_000
 """Number of splats that Niantic's own reader accepts at most; it limits what a small file can expand to."""
-_MOST_BITS, _HIGHEST_DEGREE, _DEGREE_KEPT = 24, 4, 3
+_MOST_BITS, _HIGHEST_DEGREE = 24, 4
 _ANTIALIASED = 1
 """Flag of splats that were trained with antialiasing."""
 
@@ -139,7 +139,7 @@ def read_spz(path: Path) -> tuple[Splats, list[str]]:
     fixed[..., 1:] = positions.reshape(count, 3, 3)
     # The lowest byte is empty, so that the sign is that of the 32 bits.
     means = (fixed.view("<i4")[..., 0] / 2.0 ** (8 + bits)).astype(np.float32)
-    kept = (min(degree, _DEGREE_KEPT) + 1) ** 2
+    kept = (min(degree, DEGREE_KEPT) + 1) ** 2
     sh = np.empty((count, kept, 3), np.float32)
     sh[:, 0] = (colors / 255.0 - 0.5) / _COLOR_SCALE
     sh[:, 1:] = (others.reshape(count, rest, 3)[:, : kept - 1].astype(np.float32) - 128.0) / 128.0
@@ -148,9 +148,7 @@ def read_spz(path: Path) -> tuple[Splats, list[str]]:
     ids, blur = np.zeros(count, np.int64), EPS_2D if flags & _ANTIALIASED else USUAL_EPS_2D
     read = Splats(means, quats, np.exp(logs), alphas[:, 0] / 255.0, sh, ids, blur=blur)
     splats, warnings = cleaned(path, read)
-    if degree > _DEGREE_KEPT:
-        warnings.append(f"{path.name} has spherical harmonics of degree {degree}, of which {_DEGREE_KEPT} are kept.")
-    return splats, warnings
+    return splats, warnings + degree_warnings(path, degree)
 
 
 def _unpack(path: Path) -> tuple[int, int, int, int, int, bytes]:

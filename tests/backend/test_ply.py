@@ -12,6 +12,7 @@ from backend.export import read_splats, write_splat_parts, write_splats
 from backend.model.splats import Splats, concatenate
 from backend.shared.errors import InputError
 from backend.shared.formats.ply import read_vertices, write_vertices
+from backend.shared.formats.splat_ply import read_splat_table
 from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 
 
@@ -260,6 +261,27 @@ def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):
     assert splats.object_ids.tolist() == [70_000]
 
 
+def test_degree_4_is_read_as_degree_3(tmp_path):
+    names = [*MINIMAL, *(f"f_rest_{i}" for i in range(72))]
+    path = minimal(tmp_path / "a.ply", {f"f_rest_{i}": i for i in range(72)}, names=names)
+    splats, warnings = read_splats(path)
+    assert splats.degree == 3 and warnings == ["a.ply has spherical harmonics of degree 4, of which 3 are kept."]
+    assert splats.sh[0, 1:].T.tolist() == [[start + i for i in range(15)] for start in (0, 24, 48)]
+    with pytest.raises(InputError, match="72 properties"):
+        read_splat_table(path)
+
+
+def test_discs_without_a_third_scale_are_read(tmp_path):
+    names = [name for name in MINIMAL if name != "scale_2"]
+    splats, warnings = read_splats(minimal(tmp_path / "a.ply", {}, {"scale_0": -3}, names=names))
+    assert warnings == []
+    np.testing.assert_allclose(splats.scales, np.exp([[0, -1, -1], [-3, -1, -3]]) * [1, 1, 0.001])
+    with pytest.raises(InputError, match="no property scale_2"):
+        read_splat_table(tmp_path / "a.ply")
+    with pytest.raises(InputError, match="no property scale_0, scale_2"):
+        read_splats(minimal(tmp_path / "a.ply", {}, names=[name for name in names if name != "scale_0"]))
+
+
 def test_float_ids_are_read_and_invalid_ones_become_0(tmp_path):
     names = [*MINIMAL, "object_id"]
     rows = [{"object_id": 7.0}, {"object_id": -1.0}, {"object_id": np.nan}]
@@ -317,6 +339,11 @@ def test_truncated_file_is_reported(tmp_path):
         (
             "ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
             "plain number",
+        ),
+        (
+            "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+            "property uint packed_position\nend_header\n",
+            "compressed PLY of PlayCanvas or SuperSplat",
         ),
         ("ply\nformat binary_little_endian 1.0\nelement face 1\nproperty float x\nelement vertex 1\n", "PLY header"),
     ],

@@ -201,6 +201,10 @@ def _read_header(file: BinaryIO, path: Path, text: bool) -> tuple[str, np.dtype,
             size = int(words[2])
             if element == "vertex":
                 count = size
+            elif element == "chunk":
+                raise InputError(
+                    f"{path} is a compressed PLY of PlayCanvas or SuperSplat; export it there as uncompressed PLY."
+                )
             elif size:
                 raise InputError(f"{path} has an element {element} before its vertices, which is not supported.")
         elif words[0] == "property" and element == "vertex":

@@ -94,15 +94,17 @@ def splat_dtype(names: Iterable[str], position: str = "f4") -> np.dtype:
     return np.dtype([(name, "<" + kinds.get(name, "f4")) for name in names])
 
 
-def read_splat_table(path: Path) -> np.ndarray:
+def read_splat_table(path: Path, foreign: bool = False) -> np.ndarray:
     """Read a PLY file of splats, written by this or another program.
 
     Args:
         path: The file to read.
+        foreign: Whether to accept also what only other programs write: spherical harmonics of degree 4, and discs
+            without the third scale, as of 2D Gaussian splatting.
 
     Returns:
-        A structured array (N,) with the file's properties, which include `REQUIRED` and whole spherical-harmonics
-        degrees; other properties, order and number types are the file's. Values are not checked.
+        A structured array (N,) with the file's properties, which include `REQUIRED`, apart from that scale, and whole
+        spherical-harmonics degrees; other properties, order and number types are the file's. Values are not checked.
 
     Raises:
         InputError: The file is missing, truncated, ASCII, or not a PLY of splats.
@@ -110,12 +112,12 @@ def read_splat_table(path: Path) -> np.ndarray:
     table = read_vertices(path)
     names = table.dtype.names or ()
     missing = [name for name in REQUIRED if name not in names]
-    if missing:
+    if missing and not (foreign and missing == [SCALES[2]]):
         raise InputError(
             f"{path} is a PLY file but not one of Gaussian splats: it has no property {', '.join(missing)}."
         )
     rest = sum(name.startswith(_REST) for name in names)
-    if rest not in (0, 9, 24, 45):
+    if rest not in (0, 9, 24, 45) and not (foreign and rest == 72):
         raise InputError(f"{path} has {rest} properties f_rest_*; 0, 9, 24 or 45 were expected.")
     if any(f"{_REST}{i}" not in names for i in range(rest)):
         raise InputError(f"{path} has {rest} properties f_rest_*, but they are not numbered from 0.")
