@@ -183,7 +183,7 @@ def _unpack(path: Path) -> tuple[int, int, int, int, int, bytes]:
 def _other_version(path: Path, version: int) -> InputError:
     return InputError(
         f"{path} is SPZ of version {version}, but only versions {_READABLE[0]} and {_READABLE[1]} are read; export "
-        "it as one of these or as PLY."
+        f"it as PLY, or convert it by `splat-transform {path.name} {path.stem}.ply` of PlayCanvas."
     )
 
 

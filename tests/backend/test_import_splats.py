@@ -151,7 +151,7 @@ BAD = {
     "a.spz: magic": (spz(magic=1), ("not an SPZ",)),
     "a.spz: short header": (gzip.compress(b"NGSP"), ("not an SPZ",)),
     "a.spz: version 1": (spz(version=1), ("version 1", "2 and 3")),
-    "a.spz: version 4": (spz(version=4), ("version 4", "PLY")),
+    "a.spz: version 4": (spz(version=4), ("version 4", "as PLY", "splat-transform a.spz a.ply")),
     "a.spz: plain version 4": (struct.pack("<II", 0x5053474E, 4) + bytes(50), ("version 4", "PLY")),
     "a.spz: degree": (spz(degree=5), ("damaged SPZ header",)),
     "a.spz: bits": (spz(bits=200), ("damaged SPZ header",)),
