@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..capture import Capture, Upright, compute_upright
@@ -24,12 +26,12 @@ def write_capture_cameras(folder: Reconstruction, capture: Capture) -> None:
     write_cameras(folder.folder, Cameras(capture.folder.resolve(), upright.origin, _matrix(upright), views))
 
 
-def write_splat_cameras(folder: Reconstruction, centers: np.ndarray) -> None:
+def write_splat_cameras(folder: Reconstruction, centers: np.ndarray, up: Sequence[float] | None = None) -> None:
     """Write cameras.json for splats with centers (N, 3), without photos.
 
-    The up direction is -Y, as usual for COLMAP's first camera, refined by the largest level plane of the centers.
+    Unless `up` is given, it is -Y, as usual for COLMAP's first camera, refined by the largest level plane of the centers.
     """
-    upright = compute_upright(np.eye(4)[None], centers)
+    upright = compute_upright(np.eye(4)[None], centers, None if up is None else np.array(up))
     write_cameras(folder.folder, Cameras(None, upright.origin, _matrix(upright), ()))
 
 

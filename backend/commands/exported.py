@@ -15,6 +15,7 @@ from ..export import (
 from ..model.object_model import ObjectModel
 from ..shared.events import Reporter
 from ..shared.formats.json_file import plain
+from ..shared.formats.splat_ply import Description
 from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.record import ExportRecord, update_record
 from ..training.scene import Scene
@@ -74,7 +75,9 @@ def _write_export(
         psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
     count, warnings = write_splat_parts(
-        folder.splats, lambda: (part.splats for part in splats.parts()), background=background
+        folder.splats,
+        lambda: (part.splats for part in splats.parts()),
+        description=Description(background=background),
     )
     for sentence in warnings:
         reporter.warning(sentence)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,10 @@ from ..shared.formats.splat_ply import (
     SCALES,
     SMALLEST_QUAT,
     UNOBSERVED,
-    background_comment,
+    Description,
     blur_comment,
     coefficients_of,
+    description_comments,
     property_names,
     read_blur,
     read_splat_table,
@@ -43,7 +44,7 @@ DEGREE_KEPT = 3
 
 
 def write_splats(
-    path: Path, splats: Splats, with_ids: bool = True, background: Sequence[float] | None = None
+    path: Path, splats: Splats, with_ids: bool = True, description: Description | None = None
 ) -> list[str]:
     """Write splats as PLY, atomically.
 
@@ -54,7 +55,7 @@ def write_splats(
         path: The file to write.
         splats: The splats. Those with NaN, Inf or a zero quaternion are left out.
         with_ids: Whether to write `object_id` and `unobserved`, which some programs do not accept.
-        background: Red, green and blue, 0 .. 1, of what is behind the splats, for a comment in the header.
+        description: What comments in the header tell about the splats.
 
     Returns:
         Warnings about splats that were left out.
@@ -63,19 +64,19 @@ def write_splats(
         ValueError: An object ID is not in 0 .. 2^32 - 1.
     """
     parts = [splats.select(rows) for rows in some_blocks(len(splats))]
-    return write_splat_parts(path, lambda: parts, with_ids, background)[1]
+    return write_splat_parts(path, lambda: parts, with_ids, description)[1]
 
 
 def write_splat_parts(
     path: Path,
     make: Callable[[], Iterable[Splats]],
     with_ids: bool = True,
-    background: Sequence[float] | None = None,
+    description: Description | None = None,
 ) -> tuple[int, list[str]]:
     """Write splats as PLY, as `write_splats`, without having all of them in memory.
 
     Args:
-        path, with_ids, background: As for `write_splats`.
+        path, with_ids, description: As for `write_splats`.
         make: Returns the splats in parts, at least one, the same each time; called twice. All have the same degree.
 
     Returns:
@@ -104,7 +105,7 @@ def write_splat_parts(
     if with_ids and some_unobserved:
         names.append(UNOBSERVED)
     dtype = splat_dtype(names, positions.kind)
-    comments = [blur_comment(blur), *([background_comment(background)] if background else [])]
+    comments = [blur_comment(blur), *description_comments(description or Description())]
     write_vertex_blocks(path, dtype, count, (_rows(only_usable(part), dtype) for part in make()), comments)
     return count, warnings
 
@@ -195,8 +196,8 @@ def read_splats(path: Path) -> tuple[Splats, list[str]]:
     """Read a PLY file of splats, written by this or another program.
 
     Properties may have any order and number type; unknown ones are ignored. Without `object_id`, all IDs are 0, and
-    without `scale_2`, splats are discs. Of spherical harmonics, degree 3 is kept at most. Positions keep the precision of the file; scales and opacities are float64, so that writing the splats again
-    produces the same file.
+    without `scale_2`, splats are discs. Of spherical harmonics, degree 3 is kept at most. Positions keep the precision
+    of the file; scales and opacities are float64, so that writing the splats again produces the same file.
 
     Args:
         path: The file to read.

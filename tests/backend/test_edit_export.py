@@ -14,7 +14,7 @@ import torch
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from backend.commands.cameras import write_splat_cameras
+from backend.commands.cameras import read_upright, write_splat_cameras
 from backend.editing import apply_edits, transformed
 from backend.editing.placement import middle_of
 from backend.export import coarser_splats, read_splats, write_splat, write_splats, write_spz
@@ -23,10 +23,11 @@ from backend.raster import Camera, rasterize
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats.json_file import write_json
 from backend.shared.formats.ply import read_vertices
+from backend.shared.formats.splat_ply import read_description
 from backend.shared.reconstruction.fill import fill_path
 from backend.shared.reconstruction.folder import Reconstruction
 from backend.shared.reconstruction.objects import edit_objects, read_objects, write_objects
-from backend.shared.reconstruction.record import ExportRecord, TrainingRecord, VotesRecord, update_record
+from backend.shared.reconstruction.record import ExportRecord, TrainingRecord, VotesRecord, read_record, update_record
 from backend.shared.splats.spherical_harmonics import C0
 
 from .command_result import assert_rejected
@@ -219,7 +220,8 @@ def test_export_applies_edits_and_is_readable_ply(run_command, folder, tmp_path)
 
 def test_export_without_edits_equals_splats_ply(run_command, folder, tmp_path):
     run_command("export", folder.folder, "--out", tmp_path / "all.ply")
-    assert (tmp_path / "all.ply").read_bytes() == folder.splats.read_bytes()
+    exported, own = (path.read_bytes().split(b"element vertex") for path in (tmp_path / "all.ply", folder.splats))
+    assert exported[1] == own[1], "apart from comments"
     run_command("export", folder.folder, "--out", tmp_path / "plain.ply", "--no-ids", "--sh-degree", "1")
     names = read_vertices(tmp_path / "plain.ply").dtype.names
     assert names[-1] == "rot_3" and "f_rest_8" in names and "f_rest_9" not in names
@@ -424,6 +426,23 @@ def test_import_of_splats_with_ids(run_command, folder, tmp_path):
         == EXIT_DONE
     )
     assert_rejected(run_command("render", made.folder), "checkpoint")
+
+
+@pytest.mark.parametrize("coordinates", ["capture", "blender"])
+def test_import_of_an_export_stands_and_has_names_and_background(run_command, folder, tmp_path, coordinates):
+    objects = [{"id": i, "name": name, "color": [1, 2, 3], "points": 9} for i, name in {**NAMES, 7: 'Käse "7"'}.items()]
+    write_objects(folder.objects, objects)
+    update_record(folder, export=ExportRecord(splats=60, anchors=6, background=[0.2, 0.55, 0.9]))
+    options = ["--out", tmp_path / "all.ply", "--coordinates", coordinates]
+    assert run_command("export", folder.folder, *options).code == EXIT_DONE
+    made = Reconstruction(tmp_path / "again")
+    assert run_command("import-splats", tmp_path / "all.ply", "--out", made.folder).code == EXIT_DONE
+    assert [entry.name for entry in read_objects(made.objects)] == [entry["name"] for entry in objects]
+    assert read_record(made).export.background == [0.2, 0.55, 0.9]
+    up = np.eye(3)[2] if coordinates == "blender" else UPRIGHT[2]
+    np.testing.assert_allclose(read_upright(made).rotation[2], up, atol=1e-5)
+    assert run_command("export", folder.folder, "--no-ids", *options).code == EXIT_DONE
+    assert read_description(tmp_path / "all.ply").names == {}
 
 
 def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):

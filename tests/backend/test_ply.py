@@ -12,7 +12,7 @@ from backend.export import read_splats, write_splat_parts, write_splats
 from backend.model.splats import Splats, concatenate
 from backend.shared.errors import InputError
 from backend.shared.formats.ply import read_vertices, write_vertices
-from backend.shared.formats.splat_ply import read_splat_table
+from backend.shared.formats.splat_ply import Description, read_description, read_splat_table
 from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 
 
@@ -250,6 +250,28 @@ def test_antialiased_splats_are_not_blurred_more(tmp_path, comment, blur):
     path = minimal(tmp_path / "a.ply", {})
     path.write_bytes(path.read_bytes().replace(b"made elsewhere", comment.encode()))
     assert read_splats(path)[0].blur == blur
+
+
+def test_description_is_that_of_the_comments(tmp_path):
+    told = Description([0.0, -0.6, 0.8], [0.0, 0.5, 1.0], {0: "", 7: 'Käse "7"\n\u2028', 2**32 - 1: "x"})
+    write_splats(tmp_path / "a.ply", some_splats(), description=told)
+    assert read_description(tmp_path / "a.ply") == told
+    write_splats(tmp_path / "a.ply", some_splats(), description=Description(names={i: "x" * 99 for i in range(9999)}))
+    assert read_description(tmp_path / "a.ply") == Description()
+    odd = [
+        "up 0 0 0",
+        "up 1 2",
+        "up 1 2 x",
+        "up 9e299 0 0",
+        "background 1 nan 1",
+        "object",
+        "object x y",
+        "object 1 y",
+        'object 1 "y',
+    ]
+    path = minimal(tmp_path / "b.ply", {})
+    path.write_bytes(path.read_bytes().replace(b"made elsewhere", "\ncomment ".join(odd).encode()))
+    assert read_description(path) == Description() and len(read_splats(path)[0]) == 1
 
 
 def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):

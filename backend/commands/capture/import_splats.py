@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -14,13 +15,14 @@ from ...labels import vote as vote_points
 from ...labels.points import write_points
 from ...labels.voting import find_visible_points
 from ...shared.errors import InputError
+from ...shared.formats.splat_ply import read_description
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.record import ImportRecord, update_record
+from ...shared.reconstruction.record import ExportRecord, ImportRecord, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
 from ..folder import READ, capture_record, open_output, read_capture
 from ..imported import write_objects_of
-from ..votes import VOTE, object_name
+from ..votes import VOTE
 
 _LEAST_VISIBLE = 0.5
 """Least fraction of the splats inside a view; with fewer, they are probably not in the capture's coordinates."""
@@ -39,27 +41,29 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
     reporter.expect(parts)
     reporter.begin("splats", f"Reading {options.splats.name}")
     splats, warnings = read_foreign_splats(options.splats)
+    description = read_description(options.splats)
     if len(splats) == 0:
         raise InputError(" ".join([f"{options.splats} contains no splats.", *warnings]))
     if options.splats.suffix.lower() == ".spz":
         splats = transformed(splats, DOWN_TO_UP)
     for sentence in warnings:
         reporter.warning(sentence)
-    names: dict[int, str] = {}
+    names: Mapping[int, str] = description.names
     with open_output(options):
         if options.capture is None:
-            write_splat_cameras(folder, splats.means)
+            write_splat_cameras(folder, splats.means, description.up)
             write_points(folder.points, _no_points(), _no_votes(0))
         else:
             capture = read_capture(folder, options, reporter)
             _require_visible(capture, splats.means)
-            names = {i: object_name(capture, i) for i in capture.object_ids.tolist()}
             votes = _no_votes(len(capture.points.xyz))
             if capture.has_masks:
+                names = capture.names
                 reporter.begin(VOTE, "Voting on the objects of the splats")
                 splats.object_ids = vote_points(capture, reporter=reporter, positions=splats.means).ids
                 votes = vote_points(capture)
             else:
+                names = {**capture.names, **names}
                 reporter.warning(f"{capture.folder / 'masks'} does not exist, so splats keep the objects of the file.")
             write_points(folder.points, capture.points, votes)
             update_record(folder, capture=capture_record(capture, options.max_size))
@@ -67,7 +71,8 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
         for sentence in write_splats(folder.splats, splats):
             reporter.warning(sentence)
         objects = write_objects_of(folder, splats, names)
-        update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)))
+        export = description.background and ExportRecord(len(splats), 0, background=description.background)
+        update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)), export=export)
     reporter.done(splats=len(splats), objects=objects, reconstruction=str(folder.folder))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from ...export import DOWN_TO_UP, background_sphere, coarser_splats, read_splats
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
+from ...shared.formats.splat_ply import Description
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
 from ...shared.reconstruction.record import Record, read_record
@@ -22,6 +23,7 @@ from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
 from ..folder import READ
 
+_FORMATS = ("ply", "spz", "splat")
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -32,7 +34,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     background = record.export.background if record.export else None
     if options.bake_background and not background:
         raise InputError(f"{folder.settings} names no background to bake; train on, or leave out --bake-background.")
-    kind, write = _format(options, background)
+    kind = _format(options)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
     reporter.expect({READ: ("Reading", 3.0), "edit": ("Editing", 3.0), "write": ("Saving", 3.0)})
@@ -57,7 +59,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats = splats.with_degree(options.sh_degree)
     if options.bake_background and background:
         splats = concatenate([splats, background_sphere(splats, background)])
-    splats = _in_coordinates(splats, options.coordinates, read_upright(folder), y_up=kind == "spz")
+    upright = read_upright(folder)
+    splats = _in_coordinates(splats, options.coordinates, upright, y_up=kind == "spz")
     versions = {options.out: splats}
     if options.levels:
         reporter.status("Merging splats")
@@ -70,30 +73,35 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     }
     for path in files:
         folder.require_foreign(path)
+    up = [0.0, 0.0, 1.0] if options.coordinates == "blender" else upright.rotation[2].tolist()
+    description = Description(up, None if options.bake_background else background)
+    names = {} if options.no_ids else {entry.id: entry.name for entry in objects}
     reporter.begin("write", f"Writing {len(files)} file{'' if len(files) == 1 else 's'}")
     for done, (path, (version, ids)) in enumerate(files.items(), 1):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = version if ids is None else version.select(np.isin(version.object_ids, ids))
-        for sentence in write(path, part):
+        for sentence in _write(path, part, kind, not options.no_ids, description, names):
             reporter.warning(sentence)
         reporter.progress(done, len(files), what="files")
     reporter.done(exported=str(options.out), files=len(files), splats=len(splats))
 
 
-def _format(
-    options: argparse.Namespace, background: Sequence[float] | None
-) -> tuple[str, Callable[[Path, Splats], list[str]]]:
-    """Return the name of the format, which is also the suffix of its files, and its writer."""
-    writers: dict[str, Callable[[Path, Splats], list[str]]] = {
-        "ply": lambda path, splats: write_splats(
-            path, splats, not options.no_ids, None if options.bake_background else background
-        ),
-        "spz": write_spz,
-        "splat": write_splat,
-    }
+def _format(options: argparse.Namespace) -> str:
+    """Return the name of the format, which is also the suffix of its files."""
     suffix = options.out.suffix[1:].lower()
-    kind = options.format or (suffix if suffix in writers and not options.per_object else "ply")
-    return kind, writers[kind]
+    return options.format or (suffix if suffix in _FORMATS and not options.per_object else "ply")
+
+
+def _write(
+    path: Path, splats: Splats, kind: str, with_ids: bool, description: Description, names: Mapping[int, str]
+) -> list[str]:
+    """Write a file in a format, a PLY with the names of the objects in it; returns warnings."""
+    if kind == "spz":
+        return write_spz(path, splats)
+    if kind == "splat":
+        return write_splat(path, splats)
+    named = {i: names[i] for i in np.unique(splats.object_ids).tolist() if i in names}
+    return write_splats(path, splats, with_ids, replace(description, names=named))
 
 
 def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingReporter) -> None:

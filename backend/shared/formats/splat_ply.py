@@ -1,14 +1,18 @@
 """Splats as PLY in the layout of 3D Gaussian splatting: names, order, types and limits of the properties.
 
 Opacities are logits and scales are logarithms. `f_rest` has all red coefficients first, then green, then blue. Two
-properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar. Two
-comments in the header, too: `background R G B`, the color behind the splats, in display space from 0 to 1, and
-`low_pass V`, the variance in square pixels of the filter with which they are to be drawn.
+properties are this program's own: `object_id` as uint32 and, if any splat is unobserved, `unobserved` as uchar. So
+are four comments: `background R G B`, the color behind the splats, in display space from 0 to 1; `low_pass V`,
+the variance in square pixels of the filter with which they are to be drawn; `up X Y Z`, the unit vector that is up; and
+`object ID "NAME"`, the name of an object as a string of JSON.
 """
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +42,13 @@ LARGEST_SHOWN_LOG_SCALE = 80.0
 
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _REST = "f_rest_"
-_BLUR = "low_pass"
+_BLUR, _BACKGROUND, _UP, _NAME = "low_pass", "background", "up", "object"
+_MOST_OF_NAMES = 1 << 16
+"""Characters of all names in a header, above which it has none: some programs read no headers beyond 128 KB."""
+
+_UNIT_WITHIN = 1e-3
+"""Largest difference of a direction's length from 1."""
+
 _ANTIALIASED = ("antialiased 1", "splatrendermode: mip")
 """Comments, in lower case, of Postshot and of Brush about splats that were trained with antialiasing."""
 
@@ -59,9 +69,56 @@ def sh_names(coefficients: int) -> list[tuple[str, str, str]]:
     return [_DC, *((f"{_REST}{k}", f"{_REST}{rest + k}", f"{_REST}{2 * rest + k}") for k in range(rest))]
 
 
-def background_comment(color: Sequence[float]) -> str:
-    """Return the comment of the header with the color behind the splats."""
-    return "background " + " ".join(f"{value:.4f}" for value in color)
+@dataclass(frozen=True)
+class Description:
+    """What the comments of a header tell about the splats.
+
+    Attributes:
+        up: the direction that is up, or None.
+        background: red, green and blue, 0 .. 1, of what is behind them, or None.
+        names: names of objects by ID.
+    """
+
+    up: list[float] | None = None
+    background: list[float] | None = None
+    names: dict[int, str] = field(default_factory=dict)
+
+
+def description_comments(description: Description) -> list[str]:
+    """Return the comments of the header that `read_description` reads."""
+    comments = []
+    if description.background:
+        comments.append(f"{_BACKGROUND} " + " ".join(f"{value:.4f}" for value in description.background))
+    if description.up:
+        comments.append(f"{_UP} " + " ".join(f"{value:.6g}" for value in description.up))
+    names = [f"{_NAME} {i} {json.dumps(name)}" for i, name in sorted(description.names.items())]
+    return comments + (names if sum(map(len, names)) <= _MOST_OF_NAMES else [])
+
+
+def read_description(path: Path) -> Description:
+    """Return what the comments of a file tell that was read as splats; nothing if it is no PLY."""
+    up = background = None
+    names: dict[int, str] = {}
+    for comment in read_comments(path):
+        word, _, rest = comment.partition(" ")
+        try:
+            if word == _UP:
+                up = _three_numbers(rest)
+            elif word == _BACKGROUND:
+                background = _three_numbers(rest)
+            elif word == _NAME:
+                number, _, text = rest.partition(" ")
+                if text.startswith('"'):
+                    names[int(number)] = json.loads(text)
+        except ValueError:
+            continue
+    background = background and np.clip(background, 0.0, 1.0).tolist()
+    return Description(up if up and abs(math.hypot(*up) - 1.0) < _UNIT_WITHIN else None, background, names)
+
+
+def _three_numbers(text: str) -> list[float] | None:
+    values = [float(value) for value in text.split()]
+    return values if len(values) == 3 and np.isfinite(values).all() else None
 
 
 def blur_comment(variance: float) -> str:
