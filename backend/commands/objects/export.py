@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from ..cameras import read_upright
 from ..folder import READ
 
 _FORMATS = ("ply", "spz", "splat")
+_MOST_LISTED = 10
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -83,13 +84,22 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         for sentence in _write(path, part, kind, not options.no_ids, description, names):
             reporter.warning(sentence)
         reporter.progress(done, len(files), what="files")
+    if options.per_object:
+        _warn_about_others(files, reporter)
     reporter.done(exported=str(options.out), files=len(files), splats=len(splats))
 
 
 def _format(options: argparse.Namespace) -> str:
-    """Return the name of the format, which is also the suffix of its files."""
+    """Return the name of the format, which is also the suffix of its files; raises InputError for unknown suffixes."""
     suffix = options.out.suffix[1:].lower()
-    return options.format or (suffix if suffix in _FORMATS and not options.per_object else "ply")
+    if options.format or options.per_object or not suffix:
+        return options.format or "ply"
+    if suffix not in _FORMATS:
+        raise InputError(
+            f"{options.out} ends in .{suffix}, but splats are written as .{', .'.join(_FORMATS[:-1])} or "
+            f".{_FORMATS[-1]}; name such a file, or choose a --format."
+        )
+    return suffix
 
 
 def _write(
@@ -102,6 +112,20 @@ def _write(
         return write_splat(path, splats)
     named = {i: names[i] for i in np.unique(splats.object_ids).tolist() if i in names}
     return write_splats(path, splats, with_ids, replace(description, names=named))
+
+
+def _warn_about_others(files: Iterable[Path], reporter: StoppingReporter) -> None:
+    """Warn if folders with one file per object hold other files of the format, as of objects that were renamed."""
+    written = {path.with_name(path.name.lower()) for path in files}
+    for folder in sorted({path.parent for path in files}):
+        same = (path for path in folder.iterdir() if path.suffix.lower() in {own.suffix for own in written})
+        others = sorted(path.name for path in same if path.with_name(path.name.lower()) not in written)
+        if others:
+            more = f" and {len(others) - _MOST_LISTED} more" if len(others) > _MOST_LISTED else ""
+            reporter.warning(
+                f"{folder} also contains {', '.join(others[:_MOST_LISTED])}{more}, which this export did not write; "
+                "delete what is of an earlier one."
+            )
 
 
 def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingReporter) -> None:
