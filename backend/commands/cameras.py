@@ -29,7 +29,7 @@ def write_capture_cameras(folder: Reconstruction, capture: Capture) -> None:
 def write_splat_cameras(folder: Reconstruction, centers: np.ndarray, up: Sequence[float] | None = None) -> None:
     """Write cameras.json for splats with centers (N, 3), without photos.
 
-    Unless `up` is given, it is -Y, as usual for COLMAP's first camera, refined by the largest level plane of the centers.
+    If `up` is not given, it is -Y, as usual for COLMAP's first camera, refined by the centers' largest level plane.
     """
     upright = compute_upright(np.eye(4)[None], centers, None if up is None else np.array(up))
     write_cameras(folder.folder, Cameras(None, upright.origin, _matrix(upright), ()))

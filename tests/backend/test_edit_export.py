@@ -227,6 +227,26 @@ def test_export_without_edits_equals_splats_ply(run_command, folder, tmp_path):
     assert names[-1] == "rot_3" and "f_rest_8" in names and "f_rest_9" not in names
 
 
+def test_export_refuses_unknown_suffixes(run_command, folder, tmp_path):
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.sog")
+    assert_rejected(result, "all.sog", "written as .ply, .spz or .splat")
+    assert not (tmp_path / "all.sog").exists()
+    assert run_command("export", folder.folder, "--out", tmp_path / "all.v2", "--format", "spz").code == EXIT_DONE
+    assert run_command("export", folder.folder, "--out", tmp_path / "parts.v2", "--per-object").code == EXIT_DONE
+    assert run_command("export", folder.folder, "--out", tmp_path / "all").code == EXIT_DONE
+    assert len(read_splats(tmp_path / "all")[0]) == 60
+
+
+def test_export_per_object_names_files_of_earlier_exports(run_command, folder, tmp_path):
+    options = ["export", folder.folder, "--out", tmp_path / "parts", "--per-object"]
+    assert "also contains" not in run_command(*options).err
+    (tmp_path / "parts" / "notes.txt").touch()
+    edit_objects(folder.objects, {1: {"name": "cup"}})
+    result = run_command(*options)
+    assert "parts also contains mug.ply, which" in " ".join(result.err.split())
+    assert (tmp_path / "parts" / "mug.ply").exists() and (tmp_path / "parts" / "cup.ply").exists()
+
+
 def test_export_per_object_writes_one_file_each(run_command, folder, tmp_path):
     edit_objects(folder.objects, {3: {"name": "../BLUE box"}, 1: {"merged_into": 7}})
     run_command("export", folder.folder, "--out", tmp_path / "parts", "--per-object")
@@ -443,6 +463,24 @@ def test_import_of_an_export_stands_and_has_names_and_background(run_command, fo
     np.testing.assert_allclose(read_upright(made).rotation[2], up, atol=1e-5)
     assert run_command("export", folder.folder, "--no-ids", *options).code == EXIT_DONE
     assert read_description(tmp_path / "all.ply").names == {}
+
+
+def test_import_without_a_capture_forgets_that_of_an_earlier_one(run_command, write_capture, folder, tmp_path):
+    scene = write_capture(views=4)
+    splats = some_splats(n=len(scene.xyz), degree=0)
+    splats.means = scene.xyz.astype(np.float32)
+    write_splats(tmp_path / "foreign.ply", splats)
+    made = Reconstruction(tmp_path / "imported")
+    options = ["import-splats", tmp_path / "foreign.ply", "--out", made.folder]
+    assert run_command(*options, "--capture", scene.folder).code == EXIT_DONE
+    made.strokes.write_text("{}")
+    assert run_command(*options, "--capture", scene.folder).code == EXIT_DONE and made.strokes.exists()
+    result = run_command(*options)
+    assert result.code == EXIT_DONE and f"no longer has the capture {scene.folder}" in " ".join(result.err.split())
+    assert read_record(made).capture is None and not made.strokes.exists()
+    made.strokes.write_text("{}")
+    result = run_command(*options)
+    assert result.code == EXIT_DONE and "no longer" not in result.err and made.strokes.exists()
 
 
 def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):

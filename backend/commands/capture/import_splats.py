@@ -15,9 +15,10 @@ from ...labels import vote as vote_points
 from ...labels.points import write_points
 from ...labels.voting import find_visible_points
 from ...shared.errors import InputError
+from ...shared.events import Reporter
 from ...shared.formats.splat_ply import read_description
 from ...shared.reconstruction.folder import Reconstruction
-from ...shared.reconstruction.record import ExportRecord, ImportRecord, update_record
+from ...shared.reconstruction.record import ExportRecord, ImportRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ..cameras import write_splat_cameras
 from ..folder import READ, capture_record, open_output, read_capture
@@ -53,6 +54,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
         if options.capture is None:
             write_splat_cameras(folder, splats.means, description.up)
             write_points(folder.points, _no_points(), _no_votes(0))
+            _forget_capture(folder, reporter)
         else:
             capture = read_capture(folder, options, reporter)
             _require_visible(capture, splats.means)
@@ -74,6 +76,18 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
         export = description.background and ExportRecord(len(splats), 0, background=description.background)
         update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)), export=export)
     reporter.done(splats=len(splats), objects=objects, reconstruction=str(folder.folder))
+
+
+def _forget_capture(folder: Reconstruction, reporter: Reporter) -> None:
+    """Remove the capture of an earlier import from the record, and the strokes, which are on its photos."""
+    recorded = read_record(folder).capture
+    if recorded is not None:
+        reporter.warning(
+            f"{folder.folder} no longer has the capture {recorded.folder}, nor strokes on its photos; to use it, "
+            "import the splats again with this capture."
+        )
+        update_record(folder, capture=None, votes=None)
+        folder.strokes.unlink(missing_ok=True)
 
 
 def _require_visible(capture: Capture, centers: np.ndarray) -> None:
