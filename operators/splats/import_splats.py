@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Import splats of other programs as a reconstruction whose objects can be edited."""
 
+import re
 from pathlib import Path
 
 import bpy
@@ -12,6 +13,9 @@ from ...objectgs_addon.running import background
 from ..common.import_dialog import ImportDialog
 from ..common.jobs import folder_to_import_to
 from ..common.reporting import reports_errors
+
+_GENERIC = re.compile(r"(iteration|point_cloud|splats?|ply|exports?)(_\d+)?")
+"""Names that training programs give to the files and folders of all scenes."""
 
 
 class ImportSplats(ImportDialog, bpy.types.Operator):
@@ -62,8 +66,9 @@ class ImportSplats(ImportDialog, bpy.types.Operator):
 
 
 def _folder_for(path: Path) -> Path:
-    """Return a new reconstruction folder named after the file, or after its parent if the file has a generic name."""
-    name = path.parent.name if path.stem.lower() in ("point_cloud", "splats", "splat") else path.stem
+    """Return a new reconstruction folder named after the file, or after the next folder that has no generic name."""
+    names = [path.stem, *(folder.name for folder in path.parents)]
+    name = next((name for name in names if name and not _GENERIC.fullmatch(name.lower())), path.stem)
     return locations.new_reconstruction(name, lambda folder: not folder.exists())
 
 

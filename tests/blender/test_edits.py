@@ -33,6 +33,7 @@ from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
 from objectgs.objectgs_addon.state import click_selection, object_edits, object_list, visibility
+from objectgs.operators.splats import import_splats
 
 import headless
 
@@ -1044,6 +1045,20 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
     }
     other = active()
     assert other != root and set(blender_scene.object_collections(other)) == {0, 2, HUGE}
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("garden/point_cloud/iteration_30000/point_cloud.ply", "garden"),
+        ("garden/exports/splat/splat.ply", "garden"),
+        ("garden/export_30000.ply", "garden"),
+        ("scans/garden.ply", "garden"),
+        ("scans/iteration_best.spz", "iteration_best"),
+    ],
+)
+def test_imported_splats_are_named_after_their_scene(file, name):
+    assert import_splats._folder_for(Path("/home") / file).name == name
 
 
 @pytest.mark.parametrize("kind", ["spz", "splat"])
