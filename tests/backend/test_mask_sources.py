@@ -306,6 +306,55 @@ def test_photos_that_nobody_has_annotated_get_no_mask(write, photos, tmp_path, r
     assert {each.name for each in (photos / "masks").glob("*.png")} == {f"{photo(n)}.png" for n in (0, 1)}
 
 
+def test_photo_without_segments_does_not_refuse_the_others(photos, tmp_path):
+    given = tmp_path / "given"
+    given.mkdir()
+    described = [{"size": list(SIZE[::-1]), "counts": compressed(masks_of(0) == i)} for i in NAMES]
+    masks = {"annotations": [{"segmentation": each} for each in described]}
+    (given / "photo 0.json").write_text(json.dumps(masks))
+    for content in ({"annotations": []}, []):
+        (given / "photo 1.json").write_text(json.dumps(content))
+        source = open_source(given, photos, [photo(0), photo(1)])
+        assert len(source.read(photo(0)).objects) == 2
+        empty = source.read(photo(1))
+        assert not empty.objects and empty.numbers.shape == SIZE[::-1] and not empty.numbers.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "reference"),
+    [
+        ("photo 1.jpg", "/data/upload/1/0123abcd-photo_1.jpg"),
+        ("photo (1).jpg", "/data/upload/1/0123abcd-photo_1.jpg"),
+        ("Übung 1.jpg", "/data/upload/1/0123abcd-%C3%9Cbung_1.jpg"),
+        ("photo 1.jpg", "/data/local-files/?d=table/photo%201.jpg"),
+        ("photo 1.jpg", "/data/local-files/?d=photo%201.jpg"),
+        ("photo 1.jpg", "s3://bucket/photo%201.jpg"),
+    ],
+)
+def test_photos_of_label_studio_have_other_names(tmp_path, name, reference):
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", SIZE).save(tmp_path / "images" / name)
+    path = write_label_studio(tmp_path)
+    tasks = json.loads(path.read_text())[:1]
+    tasks[0]["data"]["image"] = reference
+    path.write_text(json.dumps(tasks))
+    source = open_source(path, tmp_path, [name])
+    assert source.photos == [name] and len(source.read(name).objects) == 2
+
+
+def test_photos_in_the_folder_of_the_masks_are_no_masks(tmp_path):
+    """The masks have a word that the photos lack."""
+    for folder in ("images", "given"):
+        (tmp_path / folder).mkdir()
+        for n in (0, 1):
+            Image.effect_noise(SIZE, 50).convert("RGB").save(tmp_path / folder / f"photo {n}.png")
+    for n in (0, 1):
+        Image.fromarray(masks_of(n)).save(tmp_path / "given" / f"photo {n}_mask.png")
+    source = open_source(tmp_path / "given", tmp_path, [f"photo {n}.png" for n in (0, 1)])
+    for n in (0, 1):
+        assert (source.read(f"photo {n}.png").numbers == masks_of(n)).all()
+
+
 def test_frames_of_a_video_are_the_photos_in_the_folder(photos, tmp_path, run_command):
     path = write_cvat_video(tmp_path)
     frames = path.read_text().replace("<task>", "<task><size>{}</size>")

@@ -144,7 +144,7 @@ class PhotoJson:
     what = "a JSON file of masks for each photo"
 
     def __init__(self, folder: Path, photos: Photos) -> None:
-        self._files = {}
+        self._files, self._size = {}, photos.size
         for name in Files(folder).paths:
             stem, _, suffix = name.rpartition(".")
             if suffix.lower() == "json" and (photo := photos.find(stem)) is not None:
@@ -158,6 +158,8 @@ class PhotoJson:
         try:
             masks = content["annotations"] if isinstance(content, Mapping) else content
             sizes = {tuple(each["segmentation"]["size"]) for each in masks}
+            if not sizes:
+                return draw_shapes((), self._size(photo))
             if len(sizes) != 1:
                 raise ValueError(f"{len(sizes)} different sizes of masks")
             height, width = next(iter(sizes))

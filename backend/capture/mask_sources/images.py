@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -35,13 +35,15 @@ class MaskFiles:
         photos: the folder of the photos.
     """
 
-    def __init__(self, folder: Path, names: Iterable[str], photos: Path) -> None:
-        files, beside = Files(folder), folder.resolve() == photos.resolve()
-        self.files: dict[str, Path] = {}
-        for name in names:
-            accepted, lossy = mask_names(name, beside)
-            if (found := files.first(accepted) or files.first(lossy)) is not None:
-                self.files[name] = found
+    def __init__(self, folder: Path, names: Sequence[str], photos: Path) -> None:
+        files = Files(folder)
+        with_words = _found(files, names, beside=True)
+        self.files = with_words
+        if folder.resolve() != photos.resolve():
+            found = _found(files, names, beside=False)
+            # Where most photos have both, those without a word for masks are copies of the photos.
+            both = sum(path != found[name] for name, path in with_words.items())
+            self.files = with_words if 2 * both > len(found) else found
         self.photos: Sequence[str] = sorted(self.files)
         self.lossy = [name for name in self.photos if self.files[name].suffix.lower() in LOSSY_SUFFIXES]
         self.what = "ID masks"
@@ -71,6 +73,16 @@ class MaskFiles:
             paths = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
             self._is_black_and_white = all(_is_white(read_mask(path, self._is_color)) for path in paths)
         return self._is_black_and_white
+
+
+def _found(files: Files, names: Sequence[str], beside: bool) -> dict[str, Path]:
+    """Return the masks of the photos that have one; `beside` is as for `mask_names`."""
+    there = {}
+    for name in names:
+        accepted, lossy = mask_names(name, beside)
+        if (path := files.first(accepted) or files.first(lossy)) is not None:
+            there[name] = path
+    return there
 
 
 def _is_white(ids: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -44,9 +45,12 @@ class LabelStudioMasks:
     def __init__(self, content: Sequence[Mapping[str, Any]], file: Path, photos: Photos) -> None:
         self._file = file
         self._results: dict[str, list[Mapping[str, Any]]] = {}
+        uploaded: dict[str, list[str]] = {}
+        for name in photos.names:
+            uploaded.setdefault(_as_uploaded(name.rpartition("/")[2]), []).append(name)
         try:
             for task in content:
-                name = _photo_of(task, photos)
+                name = _photo_of(task, photos, uploaded)
                 results = [each for annotation in task["annotations"] for each in annotation["result"]]
                 if name is not None:
                     self._results[name] = [each for each in results if "original_width" in each]
@@ -75,15 +79,30 @@ class LabelStudioMasks:
         return InputError(f"{self._file} is not valid{where} ({error}); export it again from Label Studio as JSON.")
 
 
-def _photo_of(task: Mapping[str, Any], photos: Photos) -> str | None:
-    """Return the photo of a task; an upload's name begins with eight digits that the photo's lacks."""
-    for value in (*task["data"].values(), task.get("file_upload")):
-        if isinstance(value, str):
-            name = value.rpartition("/")[2]
-            found = photos.find(value) or photos.find(name) or photos.find(_UPLOAD.sub("", name))
-            if found is not None:
-                return found
+def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Sequence[str]]) -> str | None:
+    """Return the photo of a task.
+
+    Args:
+        task: the task.
+        photos: the photos of the capture.
+        uploaded: the photos by the names that Label Studio gives them when they are uploaded, before which it sets
+            eight digits.
+    """
+    given = [each for each in (*task["data"].values(), task.get("file_upload")) if isinstance(each, str)]
+    for value in dict.fromkeys([*given, *(unquote(each.rpartition("?d=")[2]) for each in given)]):
+        name = value.rpartition("/")[2]
+        found = photos.find(value) or photos.find(name) or photos.find(_UPLOAD.sub("", name))
+        if found is None and _UPLOAD.match(name):
+            fitting = uploaded.get(_UPLOAD.sub("", name), ())
+            found = fitting[0] if len(fitting) == 1 else None
+        if found is not None:
+            return found
     return None
+
+
+def _as_uploaded(name: str) -> str:
+    """Return what Label Studio makes of the name of a file that is uploaded: Django's `get_valid_filename`."""
+    return re.sub(r"[^-\w.]", "", name.strip().replace(" ", "_"))
 
 
 def _label(result: Mapping[str, Any]) -> str:
