@@ -63,7 +63,8 @@ class ImportMasks(ImportDialog, bpy.types.Operator):
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
-        given = Path(bpy.path.abspath(self.filepath)).resolve() if self.filepath else None
+        # Links are kept: the files of a model from Hugging Face are links to files with other names.
+        given = Path(bpy.path.abspath(self.filepath)).absolute() if self.filepath else None
         if given is not None and given.parent.is_dir():
             # The file browser adds a name to the folder that it shows, and may take that of the open .blend.
             is_one_of_many = given.is_file() and given.suffix.lower() in (*_IMAGES, ".blend")

@@ -85,6 +85,16 @@ def test_folder_is_chosen_with_or_without_a_name_in_it(root, submitted, tmp_path
         bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(tmp_path / "gone" / "a.json"))
 
 
+def test_links_of_a_downloaded_model_keep_their_names(root, submitted, tmp_path):
+    """The downloads of Hugging Face are links to files that have no names."""
+    (tmp_path / "blobs").mkdir()
+    (tmp_path / "blobs" / "0123abcd").write_text("{}")
+    (tmp_path / "snapshot").mkdir()
+    (tmp_path / "snapshot" / "config.json").symlink_to(tmp_path / "blobs" / "0123abcd")
+    bpy.ops.objectgs.import_masks("EXEC_DEFAULT", filepath=str(tmp_path / "snapshot" / "config.json"))
+    assert str(tmp_path / "snapshot" / "config.json") in submitted[-1].command
+
+
 def test_result_is_told_and_points_get_their_objects(root, tmp_path, monkeypatch):
     told, asked = [], []
     monkeypatch.setattr(results.messages, "show", lambda text, *_: told.append(text))
