@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
+from PIL import ExifTags, Image
 
 from ..capture.files import read_image, read_mask
 from ..capture.mask_sources.segments import Segments, Shape, draw_shapes
@@ -18,8 +18,17 @@ from ..shared.errors import InputError
 from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json
 
-_VERSION = 2
+_VERSION = 3
 """Number to be raised with changes of what is found in a photo, so that kept results are not used any more."""
+
+_TURN = Image.Transpose
+_TURNS = {
+    2: (_TURN.FLIP_LEFT_RIGHT, _TURN.FLIP_LEFT_RIGHT), 3: (_TURN.ROTATE_180, _TURN.ROTATE_180),
+    4: (_TURN.FLIP_TOP_BOTTOM, _TURN.FLIP_TOP_BOTTOM), 5: (_TURN.TRANSPOSE, _TURN.TRANSPOSE),
+    6: (_TURN.ROTATE_270, _TURN.ROTATE_90), 7: (_TURN.TRANSVERSE, _TURN.TRANSVERSE),
+    8: (_TURN.ROTATE_90, _TURN.ROTATE_270),
+}  # fmt: skip
+"""By EXIF orientation: how the pixels become upright, and how they are turned back."""
 
 
 def is_checkpoint(folder: Path) -> bool:
@@ -40,7 +49,7 @@ class Finder(NamedTuple):
         what: the kind of segments, such as "segments by a model of the type sam2".
         key: identifies the models and what they look for; results of others are not used.
         longest_side: the longer side in pixels to which larger photos are reduced before.
-        find: takes a photo (H, W, 3) uint8, and what receives the number of finished steps, and of all; returns the
+        find: takes a photo (H, W, 3) uint8, turned upright, and what receives the number of finished steps, and of all; returns the
             mask (H, W) bool and the name of each segment, or "".
     """
 
@@ -89,12 +98,15 @@ class PhotoSegments:
         for done, name in enumerate(missing):
             photo = read_image(self._images / name)
             photo.thumbnail((self._finder.longest_side,) * 2, Image.Resampling.BOX)
+            turn, back = _turns(self._images / name)
+            upright = photo if turn is None else photo.transpose(turn)
 
             def report(step: int, steps: int, done: int = done) -> None:
                 progress(done + step / (steps + 1), len(missing))
 
-            found = self._finder.find(np.array(photo), report)
-            self._keep(name, draw_shapes((Shape.of(mask, None, text) for mask, text in found), photo.size))
+            found = self._finder.find(np.array(upright), report)
+            shapes = (Shape.of(_transposed(mask, back), None, text) for mask, text in found)
+            self._keep(name, draw_shapes(shapes, photo.size))
             progress(done + 1, len(missing))
 
     def read(self, photo: str) -> Segments:
@@ -124,3 +136,17 @@ class PhotoSegments:
         np.savez_compressed(stream, ids=found.numbers.astype(np.uint16), names=np.array(found.names, np.str_))
         make_folder(self._path(name).parent)
         write_atomic(self._path(name), stream.getvalue())
+
+
+def _turns(path: Path) -> tuple[Image.Transpose | None, Image.Transpose | None]:
+    """Return how a photo, which was read as it is stored, becomes upright, as models expect it, and the way back."""
+    try:
+        with Image.open(path) as image:
+            return _TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1), (None, None))
+    except Exception:  # Its EXIF data may be damaged in any way.
+        return None, None
+
+
+def _transposed(mask: np.ndarray, turn: Image.Transpose | None) -> np.ndarray:
+    """Return a mask (h, w) bool as Pillow transposes images."""
+    return mask if turn is None else np.asarray(Image.fromarray(mask.astype(np.uint8)).transpose(turn)) > 0
