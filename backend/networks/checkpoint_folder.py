@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +16,9 @@ from ..shared.errors import InputError, MissingPackage
 from ..shared.formats.json_file import parse_json
 
 PACKAGE = "transformers>=5,<6"
+_MAJOR = "5"
+_BUILDS = "https://download.pytorch.org/whl/"
+"""Package indexes of the builds of torch and torchvision: those for CPUs, and for each version of CUDA."""
 CONFIG = "config.json"
 _WEIGHTS = ("*.safetensors", "*.bin")
 """Files with weights, of one of these kinds; of both, those of the first are used."""
@@ -76,16 +79,33 @@ def import_transformers(needed: str, option: str) -> Any:
         option: the argument of the command that needs it, for the error.
 
     Raises:
-        MissingPackage: It is not installed, or too old.
+        MissingPackage: It is not installed, or too old or new.
+        InputError: It fails, since other packages do not fit it.
     """
+    missing = MissingPackage(option, "transformers", _install(PACKAGE))
     try:
         transformers: Any = importlib.import_module("transformers")
+        if transformers.__version__.partition(".")[0] != _MAJOR:
+            raise missing
         getattr(transformers, needed)  # Imported when it is asked for.
-    except (ImportError, AttributeError) as error:
-        raise MissingPackage(option, "transformers", _install(PACKAGE)) from error
+    except MissingPackage:
+        raise
+    except Exception as error:  # What it imports may fail in any way.
+        if isinstance(error, AttributeError) or getattr(error, "name", None) == "transformers":
+            raise missing from error
+        raise _broken(error) from error
     transformers.utils.logging.set_verbosity_error()
     transformers.utils.logging.disable_progress_bar()
     return transformers
+
+
+def _broken(error: Exception) -> InputError:
+    """Return the error for packages that are installed and fail."""
+    why = str(error.__cause__ or error).strip().partition("\n")[0].rstrip(".")
+    return InputError(
+        f"The package transformers of {sys.executable} cannot be loaded ({why}); set up the backend again, or remove the "
+        "package that fails."
+    )
 
 
 def load_network(folder: Path, network: str, config: str, option: str) -> Any:
@@ -109,8 +129,10 @@ def load_network(folder: Path, network: str, config: str, option: str) -> Any:
             folder, config=settings, dtype=torch.float32, local_files_only=True, output_loading_info=True
         )
     except ImportError as error:
+        if importlib.util.find_spec("timm") is not None:
+            raise _broken(error) from error
         raise InputError(
-            f"The model in {folder} needs the package timm; run {_install('timm')} in a terminal."
+            f"The model in {folder} needs the package timm; run {install_timm()} in a terminal."
         ) from error
     except Exception as error:  # Files may be damaged in any way.
         raise unfit(folder, str(error).strip().partition("\n")[0]) from error
@@ -144,6 +166,13 @@ def _install(package: str) -> str:
     """Return the command that installs a package for this Python, as PowerShell takes it, or another shell."""
     call = "& " if os.name == "nt" else ""
     return f'{call}"{sys.executable}" -m pip install "{package}"'
+
+
+def install_timm() -> str:
+    """Return the command that installs timm with the torchvision of this build of torch; others cannot be loaded."""
+    build = torch.__version__.partition("+")[2]
+    index = f" --extra-index-url {_BUILDS}{build}" if build else ""
+    return f'{_install("timm")} "torch=={torch.__version__}"{index}'
 
 
 def digest_of(folder: Path) -> str:

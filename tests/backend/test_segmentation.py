@@ -9,10 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
 
 from backend.capture.files import read_mask
-from backend.networks.checkpoint_folder import PACKAGE
+from backend.networks import checkpoint_folder
+from backend.networks.checkpoint_folder import PACKAGE, import_transformers
 from backend.segmentation import Finder, KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
 from backend.segmentation.selection import distinct, grid_points, is_segment
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError, MissingPackage
@@ -231,12 +232,46 @@ def test_missing_packages_are_named_with_their_command(tmp_path, monkeypatch):
     transformers = pytest.importorskip("transformers")
     if not transformers.utils.is_timm_available():
         folder = write_checkpoint(tmp_path / "edgetam", model_type="edgetam")
-        refused(folder, "needs the package timm; run .* -m pip install .timm. in a terminal")
+        refused(folder, "needs the package timm; run .* -m pip install .timm. .*in a terminal")
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(MissingPackage, match="--segmenter needs the package transformers; run ") as error:
         Segmenter(write_checkpoint(tmp_path / "sam2"))
     assert f'pip install "{PACKAGE}"' in str(error.value)
     assert error.value.fields == {"lacks": "transformers", "option": "--segmenter"}
+    monkeypatch.setitem(sys.modules, "transformers", SimpleNamespace(__version__="4.46.0", SamModel=None))
+    with pytest.raises(MissingPackage):
+        import_transformers("SamModel", "--segmenter")
+
+
+@pytest.mark.parametrize(
+    ("version", "more"),
+    [
+        ("2.13.0", '"torch==2.13.0"'),
+        (
+            "2.13.0+cpu",
+            '"torch==2.13.0+cpu" --extra-index-url https://download.pytorch.org/whl/cpu',
+        ),
+    ],
+)
+def test_timm_comes_with_what_fits_the_build_of_torch(monkeypatch, version, more):
+    """Another torchvision cannot be loaded, and transformers fails then."""
+    monkeypatch.setattr(checkpoint_folder.torch, "__version__", version)
+    assert checkpoint_folder.install_timm().endswith(f' -m pip install "timm" {more}')
+
+
+def test_broken_packages_are_not_taken_for_missing_ones(monkeypatch):
+    class Broken:
+        __version__ = "5.24.0"
+
+        def __getattr__(self, name):
+            raise ModuleNotFoundError(f"Could not import module '{name}'.") from RuntimeError(
+                "torchvision::nms is gone"
+            )
+
+    monkeypatch.setitem(sys.modules, "transformers", Broken())
+    with pytest.raises(InputError, match=r"cannot be loaded \(torchvision::nms is gone\); set up") as error:
+        import_transformers("SamModel", "--segmenter")
+    assert not isinstance(error.value, MissingPackage)
 
 
 def test_weights_that_do_not_fit_are_refused(checkpoints, tmp_path):
@@ -381,14 +416,35 @@ def test_segments_are_drawn_small_over_large(tmp_path):
     assert found.numbers[20, 5] == 1 and found.numbers[5, 5] == 2 and found.numbers[5, 30] == 3
     assert list(found.objects) == [None] * 3 and calls == [(1, 1)] and not source.missing()
     assert list(found.names) == ["wall", "book", "cup"]
-    (tmp_path / "kept" / "00-2" / "a.png.npz").write_bytes(b"damaged")
+    (tmp_path / "kept" / "00-3" / "a.png.npz").write_bytes(b"damaged")
     with pytest.raises(InputError, match=r"a.png.npz"):
         source.read("a.png")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_models_see_photos_upright(tmp_path, orientation):
+    pixels = np.zeros((30, 40, 3), np.uint8)
+    pixels[3:9, 5:25] = 255
+    stored = Image.fromarray(pixels)
+    exif = stored.getexif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(tmp_path / "a.png", exif=exif)
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
+    seen = []
+
+    def find(image, progress):
+        seen.append(image)
+        return [(image[..., 0] > 0, "")]
+
+    source = PhotoSegments(Finder("segments", "00", 1024, find), tmp_path, ["a.png"], tmp_path / "kept")
+    source.find(lambda done, total: None)
+    assert np.array_equal(seen[0], upright)
+    assert np.array_equal(source.read("a.png").numbers, pixels[..., 0] > 0), "segments are those of the stored pixels"
 
 
 def test_small_models_segment_a_capture(checkpoints, scene, run_command):
     """The whole command with a network of random weights, which finds nothing."""
     result = run_command("masks", scene.folder, checkpoints["sam2"])
     assert_rejected(result, f"The model in {checkpoints['sam2']} finds no segments in the 6 photos; use another")
-    kept = scene.folder / "masks-segments" / f"{fingerprint(checkpoints['sam2'])}-2"
+    kept = scene.folder / "masks-segments" / f"{fingerprint(checkpoints['sam2'])}-3"
     assert sorted(path.name for path in kept.iterdir()) == [f"{name}.npz" for name in scene.names]

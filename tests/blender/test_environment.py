@@ -468,7 +468,7 @@ def test_probe_checks_packages_and_backend(root, monkeypatch):
 
 
 @pytest.mark.long
-def test_packages_for_models_are_added_and_others_keep_their_versions(root):
+def test_packages_for_models_are_added_and_those_of_the_backend_keep_their_versions(root):
     folder = root / "environment"
     run(environment.set_up_job(sys.executable, folder, "cpu"))
     python = environment.inspect(folder).python
@@ -489,6 +489,15 @@ def test_packages_for_models_are_added_and_others_keep_their_versions(root):
     found = subprocess.run([python, "-c", names], capture_output=True, text=True, check=True)
     assert found.stdout == "0.68 5.1\n"
     assert environment.inspect(folder).state == "ready"
+
+    wheel(root / "wheels", "smalltokens", "0.2")
+    wheel(root / "wheels", "smallmodels", "5.3", requires="smalltokens==0.2")
+    wheel(root / "wheels", "smalltokens", "0.3")
+    wheel(root / "wheels", "smallmodels", "5.4", requires="smalltokens==0.3")
+    for version in ("5.3", "5.4"):
+        models.write_text(f"smallmodels=={version}\n")
+        run(job := environment.add_models_job(python, folder))
+        assert job.state is State.DONE and job.message == f"Installed smallmodels {version}.", (job.error, job.log)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="POSIX programs")
@@ -550,6 +559,10 @@ def test_probe_rejects_other_programs(root, program):
         (
             ["error: externally-managed-environment", "hint: See PEP 668 for the detailed specification."],
             "virtual environment",
+        ),
+        (
+            ["ERROR: Cannot install x and y", "ERROR: ResolutionImpossible: for help visit https://pip.pypa.io/"],
+            "The packages that are needed do not fit others of this Python",
         ),
         ([], "it said nothing"),
     ],

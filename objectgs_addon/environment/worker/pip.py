@@ -203,6 +203,11 @@ def why_pip_failed(lines: list[str]) -> str:
             f"{other[1] if other else 'A package'} is not the file that ObjectGS was tested with (its hash differs), "
             "so nothing was installed; try again or, if that does not help, check pip's mirror settings."
         )
+    if "ResolutionImpossible" in text:
+        return (
+            "The packages that are needed do not fit others of this Python, so nothing was installed; choose another "
+            "Python, or use Set Up Backend."
+        )
     if "externally-managed-environment" in text:
         return (
             "The system manages the packages of this Python, so nothing was installed; choose a Python of a virtual "
