@@ -10,6 +10,8 @@ from .association import Association, Seen
 
 _SAME = 0.5
 """Intersection over union, counted in points, above which two objects are the same; no object can be it twice."""
+_OTHER = 0.1
+"""Intersection over union, counted in pixels, below which two objects of one ID are different ones."""
 
 
 def keep_ids(
@@ -44,3 +46,19 @@ def keep_ids(
     is_new[0] = False
     ids[is_new] = first_free + np.arange(is_new.sum())
     return found._replace(objects=[ids[objects] for objects in found.objects], points=ids[found.points])
+
+
+def ids_of_others(now: np.ndarray, then: np.ndarray) -> list[int]:
+    """Return the IDs that stand for other objects in new masks than in earlier ones.
+
+    Args:
+        now, then: (n,) int64, the IDs of the same pixels in the new and in the earlier masks, 0 for none.
+
+    Returns:
+        The IDs, ascending; those that only one of the masks has are not among them.
+    """
+    ids, columns = np.unique(np.concatenate([now, then]), return_inverse=True)
+    new, old = columns.reshape(2, -1)
+    both, ours, theirs = (np.bincount(each, minlength=len(ids)) for each in (new[new == old], new, old))
+    other = (ids > 0) & (ours > 0) & (theirs > 0) & (both < _OTHER * (ours + theirs - both))
+    return [int(object_id) for object_id in ids[other]]

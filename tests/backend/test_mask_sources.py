@@ -504,6 +504,85 @@ def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):
     assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
 
 
+def listed(capture):
+    """What masks.json has as the names of the objects, by ID."""
+    record = json.loads((capture / "masks" / "masks.json").read_text())
+    return {entry["id"]: entry["name"] for entry in record["objects"]}
+
+
+@pytest.mark.parametrize("tracks", ["0 1", "3 4"])
+def test_tracked_objects_keep_their_ids(tracks, photos, tmp_path, run_command):
+    """A track that is removed changes no ID of the others, which would meet the edits of other objects."""
+    first, second = map(int, tracks.split())
+    content = coco(compressed)
+    content["annotations"] = [
+        {**each, "segmentation": {"size": list(SIZE[::-1]), "counts": each["segmentation"]}}
+        for each in content["annotations"]
+    ]
+    for each in content["annotations"]:
+        each["track_id"] = first if each["category_id"] == 10 else second
+    path = tmp_path / "annotations.json"
+    path.write_text(json.dumps(content))
+    assert run_command("masks", photos, path).code == EXIT_DONE
+    before = listed(photos)
+    content["annotations"] = [each for each in content["annotations"] if each["category_id"] == 20]
+    path.write_text(json.dumps(content))
+    done = run_command("masks", photos, path, "--json")
+    assert done.code == EXIT_DONE and listed(photos) == {i: name for i, name in before.items() if name == "box"}
+    assert not done.messages("warning")
+
+
+def test_tracks_of_cvat_keep_their_ids(photos, tmp_path, run_command):
+    path = write_cvat_video(tmp_path)
+    assert run_command("masks", photos, path).code == EXIT_DONE
+    before = listed(photos)
+    assert run_command("masks", photos, path).code == EXIT_DONE
+    assert listed(photos) == before == {1: "mug", 2: "box"}
+
+
+def test_objects_keep_the_names_that_the_masks_do_not_say(photos, tmp_path, run_command):
+    """Also those of a labels.json that somebody has changed."""
+    given = tmp_path / "given"
+    given.mkdir()
+    (write_ids(given) / "labels.json").unlink()
+    labels = photos / "labels.json"
+    labels.write_text('{"1": "mug", "9": "spoon"}')
+    assert run_command("masks", photos, given).code == EXIT_DONE
+    assert listed(photos) == {1: "mug", 2: "object 2"}
+    assert json.loads((photos / "labels-given.json").read_text()) == {"1": "mug", "9": "spoon"}
+    labels.write_text('{"1": "mug", "2": "box"}')
+    assert run_command("masks", photos, given).code == EXIT_DONE
+    assert listed(photos) == NAMES and json.loads(labels.read_text()) == {"1": "mug", "2": "box"}
+    assert json.loads((photos / "labels-given.json").read_text()) == {"1": "mug", "9": "spoon"}
+
+
+def test_names_of_other_ids_are_not_taken(photos, tmp_path, run_command):
+    (photos / "labels.json").write_text('{"1": "spoon", "2": "fork"}')
+    path = write_cvat_video(tmp_path)
+    path.write_text(path.read_text().replace(' label="mug"', "").replace(' label="box"', ""))
+    assert run_command("masks", photos, path).code == EXIT_DONE
+    assert listed(photos) == {1: "object 1", 2: "object 2"}
+    assert json.loads((photos / "labels-given.json").read_text()) == {"1": "spoon", "2": "fork"}
+
+
+def test_ids_that_were_those_of_other_objects_are_told(photos, tmp_path, run_command):
+    for name in ("given", "other"):
+        (tmp_path / name).mkdir()
+        write_ids(tmp_path / name)
+    assert run_command("masks", photos, tmp_path / "given").code == EXIT_DONE
+    (tmp_path / "other" / "labels.json").unlink()
+    for n in (0, 1):
+        exchanged = np.array([0, 2, 1, 3], np.uint8)[masks_of(n)]
+        exchanged[:2, :2] = 3
+        Image.fromarray(exchanged).save(tmp_path / "other" / f"photo {n}_mask.png")
+    done = run_command("masks", photos, tmp_path / "other", "--json")
+    (warning,) = done.messages("warning")
+    assert "other objects with the IDs 1, 2, whose edits" in warning
+    assert listed(photos) == {1: "object 1", 2: "object 2", 3: "object 3"}, "names are not those of other objects"
+    again = run_command("masks", photos, tmp_path / "other", "--json")
+    assert again.code == EXIT_DONE and not again.messages("warning")
+
+
 def test_shapes_measure_from_the_edges_of_pixels():
     box = polygon([(10, 5), (20, 5), (20, 15), (10, 15)], SIZE)
     assert box[5:15, 10:20].all() and box.sum() == 100

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -35,7 +35,7 @@ class MaskFiles:
         photos: the folder of the photos.
     """
 
-    def __init__(self, folder: Path, names: Sequence[str], photos: Path) -> None:
+    def __init__(self, folder: Path, names: Collection[str], photos: Path) -> None:
         files = Files(folder)
         with_words = _found(files, names, beside=True)
         self.files = with_words
@@ -75,7 +75,7 @@ class MaskFiles:
         return self._is_black_and_white
 
 
-def _found(files: Files, names: Sequence[str], beside: bool) -> dict[str, Path]:
+def _found(files: Files, names: Collection[str], beside: bool) -> dict[str, Path]:
     """Return the masks of the photos that have one; `beside` is as for `mask_names`."""
     there = {}
     for name in names:

@@ -46,8 +46,8 @@ class LabelStudioMasks:
         self._file = file
         self._results: dict[str, list[Mapping[str, Any]]] = {}
         uploaded: dict[str, list[str]] = {}
-        for name in photos.names:
-            uploaded.setdefault(_as_uploaded(name.rpartition("/")[2]), []).append(name)
+        for path in photos.names:
+            uploaded.setdefault(_as_uploaded(path.rpartition("/")[2]), []).append(path)
         try:
             for task in content:
                 name = _photo_of(task, photos, uploaded)

@@ -6,6 +6,7 @@ They are made of those of another program, or of the segments that a model finds
 from __future__ import annotations
 
 import argparse
+import shutil
 import zlib
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Sequence
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...capture.colmap import Model
-from ...capture.files import Files, image_size, mask_names, read_image, read_mask, same_shape
+from ...capture.files import Files, image_size, read_image, same_shape
 from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, require_place_for_given, write_mask
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
@@ -25,18 +26,20 @@ from ...capture.names import read_names
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
-from ...labels.former_ids import keep_ids
 from ...raster import devices
 from ...segmentation import Finder, PhotoSegments, chosen_checkpoint, finders, is_checkpoint, is_sam3
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
-from ...shared.formats.json_file import read_json, write_json
-from ...shared.reconstruction.objects import default_name
+from ...shared.formats.json_file import write_json
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
+from .former_masks import FormerMasks, read_former
 
 OVERVIEW = "masks.jpg"
 """File in masks/ with a picture of some of them."""
+
+_GIVEN_LABELS = "labels-given.json"
+"""File of the capture with the names that its labels.json had before the first masks were made here."""
 
 _MASKS = "MASKS"
 """The argument with the masks, for errors."""
@@ -52,21 +55,22 @@ _CONSISTENT = 0.6
 """IDs that agree on a smaller part of the points are not taken for those of objects."""
 
 _PICTURES = 12
+_LISTED = 10
+"""Largest number of IDs in a warning."""
 
 
 class _Found(NamedTuple):
-    """The objects of all segments: their IDs for each photo, from that of no segment, and the names of the IDs."""
+    """The objects of all segments.
+
+    Attributes:
+        ids: for each photo, the IDs of its segments, from that of no segment.
+        names: by ID, the names that the source gives, or "".
+        keys: by ID, what the source calls an object in all photos, if it says so.
+    """
 
     ids: dict[str, np.ndarray]
     names: dict[int, str]
-
-
-class _Former(NamedTuple):
-    """The masks that an earlier run made: their files by photo, their IDs by name, and the largest ID of any run."""
-
-    files: dict[str, Path]
-    ids: dict[str, int]
-    largest_id: int
+    keys: dict[int, Hashable]
 
 
 class _Packed:
@@ -120,8 +124,9 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             raise InputError(f"The model in {given} finds no segments in the {len(photos)} photos; use another one.")
         raise InputError(f"{given} shows no object in the {len(photos)} photos that it has masks of; check the masks.")
     reporter.begin(_FIND, "Comparing the segments of the photos")
-    former = _former(capture, photos)
+    former = read_former(capture, photos, source.what)
     found, association, seen = _objects(segments, model, options.objects, former, reporter)
+    found = _named(found, association, segments, former, reporter)
     if options.text is not None:
         _warn_of_missing(options.text, segments, found, reporter)
     reporter.begin(_WRITE, f"Writing masks of {len(photos)} photos")
@@ -230,7 +235,7 @@ def _checked(source: MaskSource, name: str, images: Path, given: Path) -> Segmen
 
 
 def _objects(
-    segments: dict[str, _Packed], model: Model | None, how: str, former: _Former, reporter: StoppingReporter
+    segments: dict[str, _Packed], model: Model | None, how: str, former: FormerMasks, reporter: StoppingReporter
 ) -> tuple[_Found, Association | None, dict[str, Seen]]:
     """Return the objects of the segments: those that the source says, or those found by the model's points."""
     seen = {} if model is None else _seen(segments, model)
@@ -253,58 +258,12 @@ def _objects(
             "given keeps the IDs."
         )
     assert model is not None
-    association = _with_former_ids(associate(list(seen.values()), len(model.xyz)), segments, seen, former)
+    association = associate(list(seen.values()), len(model.xyz))
+    association = former.with_ids(association, seen, {name: own.shape for name, own in segments.items()})
     ids = dict(zip(seen, association.objects, strict=True))
     if not any(part.any() for part in ids.values()):
         raise InputError("No segments of two photos show the same points, so no object was found; check the masks.")
-    return _Found(ids, _names(segments, ids)), association, seen
-
-
-def _former(capture: Path, photos: Sequence[str]) -> _Former:
-    """Return the masks that this command, or strokes, have made before."""
-    folder = capture / "masks"
-    if not is_made(folder):
-        return _Former({}, {}, 0)
-    there = {name: [folder / each for each in mask_names(name)[0] if (folder / each).is_file()] for name in photos}
-    files = {name: paths[0] for name, paths in there.items() if paths}
-    try:
-        record = read_json(folder / RECORD)
-        ids = {str(entry["name"]): int(entry["id"]) for entry in record["objects"]}
-        return _Former(files, ids, int(record["largest_id"]))
-    except (InputError, KeyError, TypeError, ValueError):
-        # Of strokes, of an older version, or with IDs that a cleanup has found anew.
-        return _undescribed(capture, files)
-
-
-def _undescribed(capture: Path, files: dict[str, Path]) -> _Former:
-    """Return former masks without masks.json; files of them that are damaged are replaced now, so they do not count."""
-    names: dict[int, str] = {}
-    with suppress(InputError):
-        names = read_names(capture)
-    largest = max(names, default=0)
-    for path in files.values():
-        with suppress(InputError):
-            largest = max(largest, int(read_mask(path).max(initial=0)))
-    return _Former(files, {name: object_id for object_id, name in names.items()}, largest)
-
-
-def _with_former_ids(
-    association: Association, segments: dict[str, _Packed], seen: dict[str, Seen], former: _Former
-) -> Association:
-    """Return the objects with the IDs that they have in the former masks."""
-    ids = {}
-    for index, (name, photo) in enumerate(seen.items()):
-        if name not in former.files:
-            continue
-        try:
-            mask = read_mask(former.files[name])
-        except InputError:
-            continue  # It is replaced now, so that it may be damaged.
-        rows, columns = (
-            at * own // whole for at, own, whole in zip(photo.xy.T[::-1], mask.shape, segments[name].shape)
-        )
-        ids[index] = mask[rows, columns]
-    return keep_ids(association, list(seen.values()), ids, former.largest_id + 1)
+    return _Found(ids, _names(segments, ids), {}), association, seen
 
 
 def _warn_of_missing(
@@ -325,28 +284,48 @@ def _listed(names: Sequence[str]) -> str:
     return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
-def _given(segments: dict[str, _Packed], former: _Former) -> _Found:
+def _given(segments: dict[str, _Packed], former: FormerMasks) -> _Found:
     """Return the objects that the source says; whole numbers are IDs, and others get former or new ones."""
     known = {key for found in segments.values() for key in found.objects}
     numbers: dict[Hashable, int] = {key: key for key in known if isinstance(key, int) and 0 < key <= LARGEST_ID}
-    if len(numbers) < len(known):
+    if len(numbers) < len(known) or any(former.ids.get(key, key) != key for key in numbers):
         new = sorted((key for key in known if key not in former.ids), key=str)
-        numbers = {key: former.ids[key] for key in known if isinstance(key, str) and key in former.ids}
+        numbers = {key: former.ids[key] for key in known if key in former.ids}
         numbers |= {key: number for number, key in enumerate(new, former.largest_id + 1)}
     ids = {name: np.array([0, *(numbers[key] for key in found.objects)], np.int64) for name, found in segments.items()}
     texts = {number: key for key, number in numbers.items() if isinstance(key, str)}
-    return _Found(ids, {**_names(segments, ids), **texts})
+    return _Found(ids, {**_names(segments, ids), **texts}, {number: key for key, number in numbers.items()})
+
+
+def _named(
+    found: _Found,
+    association: Association | None,
+    segments: dict[str, _Packed],
+    former: FormerMasks,
+    reporter: StoppingReporter,
+) -> _Found:
+    """Return the objects with names for all, and warn of IDs that were those of other objects."""
+    others: list[int] = []
+    if association is None:
+        others = former.others((name, found.ids[name][own.numbers]) for name, own in segments.items())
+    if others:
+        shown = ", ".join([*map(str, others[:_LISTED]), *(["..."] if len(others) > _LISTED else [])])
+        reporter.warning(
+            f"The masks before had other objects with the IDs {shown}, whose edits the new ones get; check these in "
+            "the list of objects."
+        )
+    return found._replace(names=former.named(found.names, found.keys, others))
 
 
 def _names(segments: dict[str, _Packed], ids: dict[str, np.ndarray]) -> dict[int, str]:
-    """Return the most frequent name of each object's segments."""
+    """Return the most frequent name of each object's segments, or ""."""
     named: dict[int, Counter[str]] = {}
     for photo, of in ids.items():
         for object_id, name in zip(of[1:].tolist(), segments[photo].names, strict=True):
             if object_id:
                 named.setdefault(object_id, Counter())[name] += bool(name)
     common = {object_id: counts.most_common(1)[0] for object_id, counts in sorted(named.items())}
-    return {object_id: name if count else default_name(object_id) for object_id, (name, count) in common.items()}
+    return {object_id: name if count else "" for object_id, (name, count) in common.items()}
 
 
 def _seen(segments: dict[str, _Packed], model: Model) -> dict[str, Seen]:
@@ -388,7 +367,7 @@ def _drawn(
 
 
 def _record(
-    source: MaskSource, given: Path, found: _Found, association: Association | None, former: _Former
+    source: MaskSource, given: Path, found: _Found, association: Association | None, former: FormerMasks
 ) -> dict[str, Any]:
     """Return the content of masks.json."""
     shown_in = Counter(i for ids in found.ids.values() for i in np.unique(ids).tolist())
@@ -400,7 +379,10 @@ def _record(
         "kind": source.what,
         "found": association is not None,
         "largest_id": max(former.largest_id, *found.names, 0),
-        "objects": [{"id": i, "name": name, "photos": shown_in[i]} for i, name in found.names.items()],
+        "objects": [
+            {"id": i, "name": name, "photos": shown_in[i], **({"key": found.keys[i]} if i in found.keys else {})}
+            for i, name in found.names.items()
+        ],
         "agreement": agreement,
     }
 
@@ -410,6 +392,7 @@ def _write(
 ) -> None:
     """Write the masks, which replace those of an earlier run when they are complete, and labels.json."""
     photos, is_kept = Photos(capture).folder, given.resolve() == (capture / "masks").resolve()
+    was_made, labels = is_made(capture / "masks"), capture / "labels.json"
     if is_kept:
         record["source"] = str(kept_masks(capture).resolve())
     with new_masks(capture, kept_masks(capture) if is_kept else None) as folder:
@@ -422,7 +405,18 @@ def _write(
         sheet = contact_sheet([image for _, image in pictures], [name for name, _ in pictures])
         sheet.save(folder / OVERVIEW, quality=88)
         write_json(folder / RECORD, record)
-    write_json(capture / "labels.json", {str(i): name for i, name in found.names.items()})
+    if not was_made:
+        _keep_labels(labels, kept_masks(capture) / labels.name if is_kept else capture / _GIVEN_LABELS, found)
+    write_json(labels, {str(i): name for i, name in found.names.items()})
+
+
+def _keep_labels(labels: Path, kept: Path, found: _Found) -> None:
+    """Copy a labels.json that was not made here, unless it has the same names."""
+    with suppress(InputError):
+        if read_names(labels.parent) == found.names:
+            return
+    if labels.is_file() and not kept.exists():
+        shutil.copyfile(labels, kept)
 
 
 def _overlay(photo: Path, mask: np.ndarray) -> np.ndarray:
