@@ -103,8 +103,8 @@ def _broken(error: Exception) -> InputError:
     """Return the error for packages that are installed and fail."""
     why = str(error.__cause__ or error).strip().partition("\n")[0].rstrip(".")
     return InputError(
-        f"The package transformers of {sys.executable} cannot be loaded ({why}); set up the backend again, or remove the "
-        "package that fails."
+        f"The package transformers of {sys.executable} cannot be loaded ({why}); set up the backend again, or remove "
+        "the package that fails."
     )
 
 

@@ -49,8 +49,8 @@ class Finder(NamedTuple):
         what: the kind of segments, such as "segments by a model of the type sam2".
         key: identifies the models and what they look for; results of others are not used.
         longest_side: the longer side in pixels to which larger photos are reduced before.
-        find: takes a photo (H, W, 3) uint8, turned upright, and what receives the number of finished steps, and of all; returns the
-            mask (H, W) bool and the name of each segment, or "".
+        find: takes an upright photo (H, W, 3) uint8, and what receives the number of finished steps, and of all;
+            returns the mask (H, W) bool and the name of each segment, or "".
     """
 
     what: str

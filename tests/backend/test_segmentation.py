@@ -259,7 +259,7 @@ def test_timm_comes_with_what_fits_the_build_of_torch(monkeypatch, version, more
     assert checkpoint_folder.install_timm().endswith(f' -m pip install "timm" {more}')
 
 
-def test_broken_packages_are_not_taken_for_missing_ones(monkeypatch):
+def test_broken_packages_are_not_taken_for_missing_ones(monkeypatch, tmp_path):
     class Broken:
         __version__ = "5.24.0"
 
@@ -272,6 +272,15 @@ def test_broken_packages_are_not_taken_for_missing_ones(monkeypatch):
     with pytest.raises(InputError, match=r"cannot be loaded \(torchvision::nms is gone\); set up") as error:
         import_transformers("SamModel", "--segmenter")
     assert not isinstance(error.value, MissingPackage)
+
+    def fail(*_, **__):
+        raise ImportError("cannot import name 'x' from 'timm'")
+
+    network = SimpleNamespace(from_pretrained=fail)
+    monkeypatch.setattr(checkpoint_folder, "import_transformers", lambda *_: SimpleNamespace(A=network, B=network))
+    monkeypatch.setattr(checkpoint_folder.importlib.util, "find_spec", lambda name: name)
+    with pytest.raises(InputError, match=r"cannot be loaded \(cannot import name 'x' from 'timm'\)"):
+        checkpoint_folder.load_network(tmp_path, "A", "B", "--segmenter")
 
 
 def test_weights_that_do_not_fit_are_refused(checkpoints, tmp_path):
