@@ -26,7 +26,8 @@ def inside_hull(points: NDArray, means: NDArray, opacities: NDArray) -> NDArray[
     middle = np.median(means, axis=0)
     try:
         # Relative to the middle, since far from the origin the hull of a small object would be lost in rounding.
-        planes = np.unique(ConvexHull(means - middle).equations, axis=0)
+        corners = means - middle
+        planes = np.unique(ConvexHull(corners).equations, axis=0)
     except (QhullError, ValueError):
         return np.zeros(len(points), bool)
-    return points_inside(points - middle, planes)
+    return points_inside(points - middle, corners, planes)

@@ -114,6 +114,12 @@ def write(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> Non
         attribute.data.foreach_set(field, flat)
 
 
+def has(mesh: bpy.types.Mesh, name: str, kind: str) -> bool:
+    """Return whether a mesh has a point attribute of a Blender attribute type."""
+    attribute = mesh.attributes.get(name)
+    return attribute is not None and attribute.data_type == kind and attribute.domain == "POINT"
+
+
 def read(mesh: bpy.types.Mesh, name: str) -> np.ndarray:
     """Return an attribute of all vertices, (n,) or (n, width)."""
     attribute = mesh.attributes[name]

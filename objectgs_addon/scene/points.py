@@ -79,6 +79,28 @@ def show_points(
     _activate(obj, active if active in COLORINGS else "photo")
 
 
+def paint_points(root: bpy.types.Collection, objects: Objects) -> bool:
+    """Show the colors of the objects on the points that are shown, without reading points.ply.
+
+    Returns:
+        False if there are no points, or if they do not have the IDs of their objects.
+
+    Raises:
+        InputError: The points are in Edit Mode.
+    """
+    obj = points_of(root)
+    carrier.require_object_mode([obj])
+    if obj is None or not carrier.has(obj.data, "object_id", "INT"):
+        return False
+    colors = objects.colors(carrier.read_ids(obj.data, "object_id"))
+    if not carrier.has(obj.data, "object", "FLOAT_COLOR") or not np.array_equal(
+        carrier.read(obj.data, "object"), colors
+    ):
+        carrier.write(obj.data, "object", "FLOAT_COLOR", colors)
+        obj.data.update()
+    return True
+
+
 def shown_points(view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D) -> Iterator[bpy.types.Object]:
     """Yield the point clouds that a view layer shows in one of its viewports."""
     for obj in view_layer.objects:

@@ -19,7 +19,7 @@ from ...backend.shared.reconstruction.edits.splat_edits import missing_sentence,
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of, put_capture_last
-from .edits.floaters import mark_distant, mark_floaters
+from .edits.floaters import mark_distant, mark_floaters, near_sphere_of
 from .edits.recover import recover_parts
 from .edits.show import show_edits
 from .edits.single_splats import (
@@ -50,7 +50,7 @@ from .kinds import (
 from .meshes.show import apply_shown, update_meshes
 from .object_collection import NAME, center_of, ensure_pivot, new_collection, paint, remove, remove_if_empty, rename
 from .object_display import Objects
-from .points import read_points, show_points
+from .points import paint_points, read_points, show_points
 from .shading.materials import splats_material
 from .shading.modifiers import add_splats_modifiers, update_groups, use_material
 from .shading.node_groups import HIDDEN
@@ -114,7 +114,7 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
     applied = edits.apply(table_keys(splats) if edits else np.zeros(0), ids_of(splats), captured_positions(splats))
     splat_groups = _groups(splats, applied.object_ids, objects)
     anchor_groups = {} if anchors is None else _groups(anchors, ids_of(anchors), objects)
-    selected = _selected_keys(collections)
+    selected, sphere = _selected_keys(collections), near_sphere_of(root)
     parent = parent_of(root)
     makers = _Makers(objects, LARGEST_POINT * median_scale(splats))
     shown = Shown(warnings=warnings + more)
@@ -135,9 +135,9 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
             update_groups(obj)
         carrier.fill(obj.data, positions - center_of(pivot), attributes)
         obj.data[BLUR] = blur
-        select_splats(obj.data, np.isin(keys_of(obj.data), selected))
+        select_splats(obj.data, _among(keys_of(obj.data), selected))
         mark_floaters(obj, positions)
-        mark_distant(root, obj, positions)
+        mark_distant(obj, positions, sphere)
         shown.splats += len(own_splats)
         if own_anchors is not None:
             carrier.fill(
@@ -176,9 +176,17 @@ def show_result(root: bpy.types.Collection, folder: Path) -> Shown:
 
 
 def _selected_keys(collections: dict[int, bpy.types.Collection]) -> np.ndarray:
-    """Return the keys of the selected splats of objects, which remain selected while the splats are the same."""
+    """Return the sorted keys of the selected splats of objects, which stay selected while the splats are the same."""
     meshes = [part.data for each in collections.values() if (part := part_of(each, SPLATS)) is not None]
-    return np.concatenate([np.zeros(0, np.uint64), *(keys_of(mesh)[selected_splats(mesh)] for mesh in meshes)])
+    return np.sort(np.concatenate([np.zeros(0, np.uint64), *(keys_of(mesh)[selected_splats(mesh)] for mesh in meshes)]))
+
+
+def _among(keys: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return which keys (n,) are among sorted ones, without sorting these for each object as NumPy would."""
+    places = np.searchsorted(chosen, keys)
+    found = places < len(chosen)
+    found[found] = chosen[places[found]] == keys[found]
+    return found
 
 
 def result_is_newer(root: bpy.types.Collection) -> bool:
@@ -195,15 +203,21 @@ def _written(folder: Path) -> str:
         return ""
 
 
-def show_objects(root: bpy.types.Collection, folder: Path) -> None:
+def show_objects(root: bpy.types.Collection, folder: Path, is_vote: bool = True) -> None:
     """Update points and object collections from points.ply and objects.json after a vote or an edit.
 
     This updates names, colors and edits. If merges or left-out objects changed, it calls `show_result`.
+
+    Args:
+        root: the reconstruction's collection.
+        folder: the reconstruction folder.
+        is_vote: read points.ply again; after edits the points of many photos would keep the user waiting.
     """
     folder = Path(folder)
     objects = Objects.read(folder)
     capture, parent = capture_of(root), parent_of(root)
-    if capture is not None and parent is not None and Reconstruction(folder).points.is_file():
+    is_there = capture is not None and parent is not None and Reconstruction(folder).points.is_file()
+    if is_there and (is_vote or not paint_points(root, objects)):
         carrier.require_object_mode([points_of(root)])
         show_points(capture, parent, f"{root.name} points", read_points(folder), origin_of(root), objects)
     if (

@@ -214,7 +214,7 @@ def show(root: bpy.types.Collection) -> None:
     if Reconstruction(folder).splats.exists():
         scene.show_result(root, folder)
     else:
-        scene.show_objects(root, folder)
+        scene.show_objects(root, folder, is_vote=False)
 
 
 def remove(root: bpy.types.Collection, object_ids: Iterable[int], floaters: bool, fill: bool = False) -> None:
@@ -396,7 +396,7 @@ def _show_written(root: bpy.types.Collection) -> None:
     """Show names and colors in the folder on points and in the other scenes."""
     try:
         if object_list.scenes_of(root):
-            scene.show_objects(root, scene.folder_of(root))
+            scene.show_objects(root, scene.folder_of(root), is_vote=False)
             fill(root, in_place=True)  # An update callback must not remove its row.
         notify(root)
     except (InputError, OSError) as error:

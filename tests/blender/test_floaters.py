@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.reconstruction.objects import edit_objects, read_objects
-from objectgs.backend.shared.splats.floaters import floating
+from objectgs.backend.shared.splats.floaters import floating, near_sphere
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.scene import kinds
+from objectgs.objectgs_addon.scene.edits import floaters
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 
 import headless
@@ -121,6 +122,13 @@ def test_distant_surroundings_do_not_count_for_the_view(root):
     assert np.ptp(np.array(evaluated.bound_box)) == 0 and 1.5 < size_of(part(root)).max() < 3
     assert bpy.ops.objectgs.clean_floaters(everything=True) == {"FINISHED"}
     assert hidden(root, 0) == floating(places[300:]).sum(), "as the backend's export does"
+
+
+def test_points_are_measured_once_for_all_objects(root, monkeypatch):
+    measured = []
+    monkeypatch.setattr(floaters, "near_sphere", lambda points: measured.append(len(points)) or near_sphere(points))
+    blender_scene.show_result(root, blender_scene.folder_of(root))
+    assert measured == [len(kinds.points_of(root).data.vertices)]
 
 
 def test_clean_floaters_is_an_edit_of_the_object(root):

@@ -3,6 +3,7 @@
 
 import shutil
 
+import numpy as np
 import pytest
 
 import headless
@@ -13,7 +14,9 @@ from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.panels.objects.panel import describe
 from objectgs.objectgs_addon.picking import selection
-from objectgs.objectgs_addon.state import object_list, visibility
+from objectgs.objectgs_addon.scene import carrier, kinds, result
+from objectgs.objectgs_addon.scene.points import read_points
+from objectgs.objectgs_addon.state import object_edits, object_list, visibility
 
 
 @pytest.fixture
@@ -67,6 +70,27 @@ def test_name_and_color_are_stored_and_shown(root):
     assert collection.name == "tall thing"
     splats = next(part for part in scene.parts_of(collection) if scene.kind_of(part) == "splats")
     assert splats.color[0] == pytest.approx(1.0) and splats.color[1] == pytest.approx(0.2159, abs=0.001)
+
+
+def test_edits_of_rows_do_not_read_the_points_again(root, monkeypatch):
+    """With a million points, each rename would keep the user waiting."""
+    mesh = kinds.points_of(root).data
+    object_id = first_ids(root)[0]
+    item = next(i for i in root.objectgs.objects if scene.from_stored(i.object_id) == object_id)
+    own = np.flatnonzero(carrier.read_ids(mesh, "object_id") == object_id)
+    read = []
+    monkeypatch.setattr(result, "read_points", lambda folder: read.append(folder) or read_points(folder))
+    item.name = "cup"
+    item.color = (1.0, 0.0, 0.0)
+    object_edits.flush()
+    assert carrier.read(mesh, "object")[own] == pytest.approx(np.tile([1.0, 0, 0, 1], (len(own), 1)))
+    item.chosen = False
+    assert entry(root, object_id).name == "cup" and entry(root, object_id).left_out
+    assert len(own) and (carrier.read(mesh, "object")[own, 0] < 0.5).all(), "they are gray"
+    assert not read
+    mesh.attributes.remove(mesh.attributes["object_id"])
+    item.name = "mug"
+    assert read and "object_id" in mesh.attributes
 
 
 def test_solo_toggles_visibility_of_others(root):

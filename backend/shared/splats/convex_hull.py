@@ -29,18 +29,25 @@ def reliable_centers(means: NDArray, opacities: NDArray) -> NDArray[np.float64]:
     return means[distances <= MAX_DISTANCE_RATIO * np.percentile(distances, 75)]
 
 
-def points_inside(points: NDArray, planes: NDArray) -> NDArray[np.bool_]:
+def points_inside(points: NDArray, corners: NDArray, planes: NDArray) -> NDArray[np.bool_]:
     """Test which points are inside a convex hull.
 
     Args:
         points: (n, 3).
+        corners: the points (m, 3) that span the hull, m > 0.
         planes: the hull's faces (p, 4): outward normal and offset, such that normal . x + offset <= 0 inside.
 
     Returns:
         (n,) bool.
     """
-    found = np.ones(len(points), bool)
+    # Most points of a scene are outside of the box around a hull, which is tested much faster than its faces.
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    left = np.arange(len(points))
+    for axis in range(3):
+        along = points[left, axis]
+        left = left[(along >= low[axis]) & (along <= high[axis])]
     for plane in planes:
-        left = np.flatnonzero(found)
-        found[left] = points[left] @ plane[:3] + plane[3] <= 0.0
+        left = left[points[left] @ plane[:3] + plane[3] <= 0.0]
+    found = np.zeros(len(points), bool)
+    found[left] = True
     return found

@@ -40,21 +40,33 @@ def far(means: NDArray) -> NDArray[np.bool_]:
     return distances > FAR_RATIO * np.percentile(distances, 75)
 
 
-def distant(means: NDArray, points: NDArray) -> NDArray[np.bool_]:
+def near_sphere(points: NDArray) -> tuple[NDArray, float]:
+    """Return the center (3,) and the radius of the sphere outside of which splats show distant surroundings.
+
+    The radius is infinite if there are too few points to tell.
+
+    Args:
+        points: the capture's points (m, 3).
+    """
+    if len(points) < FEWEST:
+        return np.zeros(3), np.inf
+    middle = np.median(points, axis=0)
+    distances = np.linalg.norm(points.astype(np.float64) - middle, axis=1)
+    return middle, BEYOND * float(np.percentile(distances, ALMOST_ALL))
+
+
+def distant(means: NDArray, center: NDArray, radius: float) -> NDArray[np.bool_]:
     """Find the splats that show distant surroundings.
 
     Args:
         means: splat centers (n, 3).
-        points: the capture's points (m, 3), in the same coordinates.
+        center: center (3,) of the capture's `near_sphere`, in the same coordinates.
+        radius: its radius.
 
     Returns:
         (n,) bool.
     """
-    if len(points) < FEWEST:
-        return np.zeros(len(means), bool)
-    middle = np.median(points, axis=0)
-    extent = np.percentile(np.linalg.norm(points.astype(np.float64) - middle, axis=1), ALMOST_ALL)
-    return np.linalg.norm(means.astype(np.float64) - middle, axis=1) > BEYOND * extent
+    return np.linalg.norm(means.astype(np.float64) - center, axis=1) > radius
 
 
 def floating(means: NDArray) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ....backend.shared.reconstruction.objects import SceneObject
 from ....backend.shared.splats.convex_hull import points_inside, reliable_centers
-from ....backend.shared.splats.floaters import distant, floating
+from ....backend.shared.splats.floaters import distant, floating, near_sphere
 from .. import carrier
 from ..kinds import OBJECT_ID, OBJECT_PARENT, SPLATS, collection_of, object_collections, part_of, points_of
 from ..object_collection import center_of
@@ -76,18 +76,21 @@ def _found(mesh: bpy.types.Mesh) -> np.ndarray:
     return found
 
 
-def mark_distant(root: bpy.types.Collection, obj: bpy.types.Object, positions: np.ndarray) -> None:
-    """Store which splats of a newly filled carrier show distant surroundings, by the capture's points if there are any.
+def near_sphere_of(root: bpy.types.Collection) -> tuple[np.ndarray, float]:
+    """Return the `near_sphere` of the capture's points relative to the reconstruction's origin."""
+    points = points_of(root)
+    return near_sphere(np.zeros((0, 3)) if points is None else carrier.read(points.data, "position"))
+
+
+def mark_distant(obj: bpy.types.Object, positions: np.ndarray, sphere: tuple[np.ndarray, float]) -> None:
+    """Store which splats of a newly filled carrier show distant surroundings.
 
     Args:
-        root: the reconstruction's collection.
         obj: the carrier.
         positions: (n, 3) float64 positions of its splats relative to the reconstruction's origin.
+        sphere: what `near_sphere_of` returns for the reconstruction.
     """
-    points = points_of(root)
-    if points is None:
-        return
-    found = distant(positions, carrier.read(points.data, "position"))
+    found = distant(positions, *sphere)
     if found.any() or DISTANT in obj.data.attributes:
         update_groups(obj)
         carrier.write(obj.data, DISTANT, "BOOLEAN", found)
@@ -169,8 +172,9 @@ def inside_hull(points: np.ndarray, means: np.ndarray, opacities: np.ndarray) ->
     if len(means) < 4:
         return np.zeros(len(points), bool)
     middle = np.median(means, axis=0)
-    planes = _planes(means - middle)
-    return points_inside(points - middle, planes) if len(planes) else np.zeros(len(points), bool)
+    corners = means - middle
+    planes = _planes(corners)
+    return points_inside(points - middle, corners, planes) if len(planes) else np.zeros(len(points), bool)
 
 
 def _planes(corners: np.ndarray) -> np.ndarray:
