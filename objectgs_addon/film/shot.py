@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import bpy
@@ -72,7 +73,7 @@ def shot_of(
     instances = _instances_of(scene, root, _paths(view_layer, root))
     before = scene.frame_current, scene.frame_subframe
     has_markers = any(marker.camera is not None for marker in scene.timeline_markers)
-    made, scale = [], None
+    made, scale, places = [], None, _Places()
     try:
         with _evaluated_pivots(view_layer, instances):
             for done, number in enumerate(frames, 1):
@@ -85,7 +86,7 @@ def shot_of(
                     scene.frame_set(whole, subframe=time - whole)
                     frame = _RootTransform.of(root, scale)
                     scale = frame.scale
-                    taken.append(_sample(scene, view_layer, seen_by, instances, frame, time))
+                    taken.append(_sample(scene, view_layer, seen_by, instances, frame, time, places))
                 made.append(Frame(number, _shutter(scene, number, samples), taken))
                 progress(done, len(frames))
     finally:
@@ -164,6 +165,11 @@ class _RootTransform:
         left[:, 2] *= np.sign(np.linalg.det(left @ right))
         return cls(origin_of(root), left @ right, scale or float(np.cbrt(stretches.prod())), world[:3, 3])
 
+    @cached_property
+    def key(self) -> bytes:
+        """The transform as bytes, which are the same for the same transform."""
+        return b"".join(np.asarray(each).tobytes() for each in (self.origin, self.rotation, self.scale, self.shift))
+
     def map_from(self, world: np.ndarray, center: np.ndarray) -> np.ndarray:
         """Convert an object's world matrix to its transform in capture coordinates.
 
@@ -193,7 +199,7 @@ class _RootTransform:
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _SplatsInstance:
     """A splat carrier in the scene, or an instance of it.
 
@@ -244,6 +250,25 @@ class _SplatsInstance:
 
 def _is_shown(layer: bpy.types.LayerCollection) -> bool:
     return not (layer.exclude or layer.indirect_only or layer.collection.hide_render)
+
+
+class _Places:
+    """Transforms of objects in capture coordinates, computed again only for those that have moved since the last time.
+
+    Most objects of a scene rest, and a shot has many samples.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[_SplatsInstance, tuple[bytes, np.ndarray | None]] = {}
+
+    def place(self, instance: _SplatsInstance, transform: _RootTransform) -> np.ndarray | None:
+        """Return an object's (4, 4) transform at the current frame; None if it has no volume."""
+        world = instance.world()
+        key = world.tobytes() + transform.key
+        if instance not in self._known or self._known[instance][0] != key:
+            place = transform.map_from(world, center_of(instance.pivot))
+            self._known[instance] = key, None if is_singular(place) else place
+        return self._known[instance][1]
 
 
 def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstance]) -> None:
@@ -376,12 +401,13 @@ def _sample(
     instances: Any,
     transform: _RootTransform,
     time: float,
+    places: _Places,
 ) -> Sample:
     objects: dict[int, list[np.ndarray]] = {}
     for instance in instances:
         if instance.is_seen():
-            place = transform.map_from(instance.world(), center_of(instance.pivot))
-            if not is_singular(place):
+            place = places.place(instance, transform)
+            if place is not None:
                 objects.setdefault(instance.object_id, []).append(place)
     if camera is None or camera.type != "CAMERA":
         raise InputError(f"The scene {scene.name} has no camera at frame {time:g}; choose one.")

@@ -191,6 +191,19 @@ def test_object_that_rests_in_a_part_of_its_animation_is_placed_there(root):
         assert objects[2].maps is None, "an object that cannot move keeps its place of objects.json"
 
 
+def test_resting_objects_are_placed_once(root, monkeypatch):
+    """With hundreds of objects, the samples of motion blur would keep the user waiting."""
+    pivot = ensure_pivot(root, 1)
+    for frame, moved in ((1, 0.0), (4, 1.0)):
+        pivot.location.x = moved
+        pivot.keyframe_insert("location", frame=frame)
+    placed, transform = [], film.shot._RootTransform
+    place = transform.map_from
+    monkeypatch.setattr(transform, "map_from", lambda *args: placed.append(args) or place(*args))
+    shoot(root, (1, 2, 3, 4))
+    assert len(placed) == len({0, *OBJECTS}) + 3
+
+
 def test_whole_scene_mesh_does_not_hide_the_rest(root):
     folder = blender_scene.folder_of(root)
     write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
