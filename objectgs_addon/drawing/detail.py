@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Levels of detail of the splats that are drawn, built by a thread where a scene has many.
 
-They are cached for the identity of the arrays, and dropped with these. Until all levels of a scene are built, all of
-its splats are drawn.
+They are cached for the identity of the arrays, and dropped with these. New levels are drawn once all of a scene
+are built, since the textures are filled again for them; until then, all splats of their objects are drawn.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ SMALLEST = 16 * BLOCK
 """Objects of fewer splats are drawn without."""
 
 _built: weakref.WeakKeyDictionary[SplatArrays, Future[Levels | None]] = weakref.WeakKeyDictionary()
+_drawn: weakref.WeakSet[SplatArrays] = weakref.WeakSet()
+"""Splats whose levels have been drawn."""
 _thread: ThreadPoolExecutor | None = None
 
 
@@ -34,9 +36,12 @@ def with_levels(objs: Sequence[DrawnObject]) -> list[DrawnObject]:
     if sum(len(obj.splats.means) for obj in objs) <= MOST:
         return list(objs)
     futures = [_future(obj.splats) if len(obj.splats.means) >= SMALLEST else None for obj in objs]
-    if not all(future is None or future.done() for future in futures):
-        return list(objs)
-    return [obj if future is None else replace(obj, levels=future.result()) for obj, future in zip(objs, futures)]
+    if all(future is None or future.done() for future in futures):
+        _drawn.update(obj.splats for obj, future in zip(objs, futures) if future is not None)
+    return [
+        replace(obj, levels=future.result()) if future is not None and obj.splats in _drawn else obj
+        for obj, future in zip(objs, futures)
+    ]
 
 
 def is_building() -> bool:
@@ -69,6 +74,7 @@ def unregister() -> None:
     """Stop building."""
     global _thread
     _built.clear()
+    _drawn.clear()
     thread, _thread = _thread, None
     if thread is not None:
         thread.shutdown(cancel_futures=True)

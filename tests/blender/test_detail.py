@@ -102,6 +102,34 @@ def test_levels_are_built_once_and_dropped_with_the_splats(many):
     assert not len(detail._built)
 
 
+def test_an_edit_of_one_object_keeps_the_levels_of_the_others(many, monkeypatch):
+    objs = [drawn(splats()), drawn(splats(1))]
+    assert all(obj.levels is not None for obj in (detail.with_levels(objs), wait(objs))[1])
+    may_build = threading.Event()
+    monkeypatch.setattr(detail, "build_levels", lambda *args: may_build.wait(30) and build_levels(*args))
+    objs[1] = drawn(splats(2))
+    first, second = detail.with_levels(objs)
+    assert first.levels is not None and second.levels is None and detail.is_building()
+    may_build.set()
+    assert all(obj.levels is not None for obj in wait(objs))
+
+
+def test_new_levels_are_drawn_once_all_are_built(many, monkeypatch):
+    may_build = threading.Event()
+
+    def build(means, *args):
+        assert len(means) == COUNT or may_build.wait(30)
+        return build_levels(means, *args)
+
+    monkeypatch.setattr(detail, "build_levels", build)
+    objs = [drawn(splats()), drawn(splats(1, COUNT + 1))]
+    detail.with_levels(objs)
+    detail._built[objs[0].splats].result(30)
+    assert all(obj.levels is None for obj in detail.with_levels(objs))
+    may_build.set()
+    assert all(obj.levels is not None for obj in wait(objs))
+
+
 def test_building_stops_when_the_splats_are_dropped(many, monkeypatch):
     begun, stopped = threading.Event(), threading.Event()
 
