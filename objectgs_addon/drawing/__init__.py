@@ -8,7 +8,7 @@ built, `entries` chooses those for a view, `order` sorts them, `renderer` draws 
 
 from .gather import collections_by_part, placed_parts, shown, splat_parts
 from .splat_arrays import selected_of, selection_changed, show_labels, splats_changed
-from .viewport import failure, picture, point_at, redraw, register, show, unregister
+from .viewport import failure, picture, point_at, redraw, register, switch, unregister
 
 __all__ = [
     "collections_by_part",
@@ -20,10 +20,10 @@ __all__ = [
     "register",
     "selected_of",
     "selection_changed",
-    "show",
     "show_labels",
     "shown",
     "splat_parts",
     "splats_changed",
+    "switch",
     "unregister",
 ]

@@ -65,19 +65,35 @@ def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, pro
 
 
 def _draw() -> None:
-    global _failure, _refusal
     context = bpy.context
-    space, region = context.space_data, context.region_data
-    properties = context.scene.objectgs
-    if not properties.draw_splats or region is None or _failure is not None or not is_in_file():
+    is_on = context.scene.objectgs.draw_splats and context.region_data is not None
+    if not is_on or _failure is not None or not is_in_file():
         return
     try:
         renderer()
     except Exception as error:  # Driver failures raise various exceptions.
-        _failure = f"The graphics driver cannot draw splats: {error}"
-        print(f"ObjectGS: {_failure}", flush=True)
-        bpy.app.timers.register(_show_previews, first_interval=0.0)  # Data cannot be changed while drawing.
+        _fail(f"The graphics driver cannot draw splats: {error}")
         return
+    try:
+        _draw_splats(context)
+    except (MemoryError, RuntimeError) as error:
+        renderer().free()
+        _fail(f"Splats cannot be drawn, maybe for lack of memory ({error}); hide some and switch Draw Splats on again")
+
+
+def _fail(reason: str) -> None:
+    """Draw no splats but show their previews, instead of failing again in each redraw."""
+    global _failure
+    _failure = reason
+    print(f"ObjectGS: {_failure}", flush=True)
+    bpy.app.timers.register(_show_previews, first_interval=0.0)  # Data cannot be changed while drawing.
+
+
+def _draw_splats(context: bpy.types.Context) -> None:
+    """Draw the splats of the context's viewport over it."""
+    global _refusal
+    space, region = context.space_data, context.region_data
+    properties = context.scene.objectgs
     _refusal = None
     parts = gather.placed_parts(context.view_layer, space)
     objs = gather.gather(parts, properties.colors, _pointed_at, space.overlay.show_overlays)
@@ -129,7 +145,17 @@ def _show_previews() -> None:
         show(scene.objectgs)
 
 
-def show(properties: Any, _context: bpy.types.Context = None) -> None:
+def switch(properties: Any, _context: bpy.types.Context) -> None:
+    """Draw a scene's splats or show their previews, as its setting says, and try again what has failed before."""
+    global _failure
+    if _failure is None:
+        show(properties)
+    else:
+        _failure = None
+        _show_previews()  # Of all scenes, whose previews are shown since.
+
+
+def show(properties: Any) -> None:
     """Switch a scene's splats between the geometry nodes preview and this drawing."""
     undrawn = _undrawn()
     for part in gather.carriers(properties.id_data):

@@ -302,7 +302,7 @@ class SceneProperties(bpy.types.PropertyGroup):
     draw_splats: BoolProperty(
         name="Draw Splats",
         default=True,
-        update=drawing.show,
+        update=drawing.switch,
         description="Draw splats in the 3D viewports as in the final image, instead of a preview by points",
     )
     colors: EnumProperty(

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Input of the viewport drawing: splat arrays, their order and placement, and objects with a hidden preview."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+
+import headless
 
 bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.shared.color.recolor import Recolor
 from objectgs.objectgs_addon import scene
-from objectgs.objectgs_addon.drawing import gather, splat_arrays
+from objectgs.objectgs_addon.drawing import gather, splat_arrays, viewport
 from objectgs.objectgs_addon.drawing.order import back_to_front
 from objectgs.objectgs_addon.scene import carrier
-from objectgs.objectgs_addon.scene.shading.modifiers import show_preview
+from objectgs.objectgs_addon.scene.shading.modifiers import modifier_of, show_preview
+from objectgs.objectgs_addon.scene.shading.node_groups import SPLATS_GROUP
 from objectgs.objectgs_addon.state import viewports
 
 from .building import HUGE, write_folder
@@ -27,6 +32,19 @@ def root(tmp_path, fresh):
     splat_arrays.register()
     yield root
     splat_arrays.unregister()
+
+
+@pytest.fixture
+def registered():
+    extension = headless.extension()
+    extension.register()
+    yield
+    extension.unregister()
+
+
+def preview_of(obj):
+    """Return the modifier that shows splats where they are not drawn."""
+    return modifier_of(obj, SPLATS_GROUP)
 
 
 def part(root, object_id: int):
@@ -119,6 +137,36 @@ def test_preview_is_hidden_while_drawing(root):
     bpy.context.view_layer.update()
     assert evaluated_size(obj) == seen
     assert [(modifier.name, modifier.show_viewport, modifier.show_render) for modifier in obj.modifiers] == kept
+
+
+def test_drawing_that_fails_is_not_tried_in_each_redraw(root, registered, monkeypatch, capsys):
+    """The user switches it on again once there is memory for it."""
+    owner, later, tried = bpy.context.scene, [], []
+
+    def draw(*_):
+        tried.append(True)
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr(viewport, "_renderer", SimpleNamespace(free=lambda: None))
+    monkeypatch.setattr(viewport, "_failure", None)
+    monkeypatch.setattr(viewport.gather, "placed_parts", draw)
+    owner.objectgs.draw_splats = True
+    assert not preview_of(part(root, 1)).show_viewport
+    manager = bpy.context.window_manager
+    context = SimpleNamespace(scene=owner, region_data=True, space_data=None, view_layer=None, window_manager=manager)
+    timers = SimpleNamespace(register=lambda call, **_: later.append(call))
+    fake = SimpleNamespace(context=context, data=bpy.data, app=SimpleNamespace(timers=timers))
+    monkeypatch.setattr(viewport, "bpy", fake)
+    viewport._draw()
+    viewport._draw()
+    assert len(tried) == len(later) == 1 and "9 GiB" in viewport.failure() and "9 GiB" in capsys.readouterr().out
+    later[0]()
+    assert preview_of(part(root, 1)).show_viewport
+    owner.objectgs.draw_splats = False
+    owner.objectgs.draw_splats = True
+    assert viewport.failure() is None and not preview_of(part(root, 1)).show_viewport
+    viewport._draw()
+    assert len(tried) == 2
 
 
 @pytest.mark.parametrize("orthographic", [False, True])
