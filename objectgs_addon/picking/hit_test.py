@@ -18,6 +18,7 @@ MIN_PROBABILITY = 0.1
 """Minimum contribution of an object's splats to a pixel for the object to count as visible there."""
 
 _SEE_THROUGH = ("splats", "points", "anchors")
+_LINES = ("WIRE", "BOUNDS")
 _GRID = 12
 """Number of mesh sample points per side of a rectangle."""
 
@@ -34,13 +35,14 @@ class Hit:
         return (self.collection or self.obj).name
 
 
-def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
+def object_at(context: bpy.types.Context, x: float, y: float, needs_splats: bool = False) -> Hit | None:
     """Return the object that the context's viewport shows at a pixel.
 
     Args:
         context: context of a 3D viewport.
         x: pixel in the region from the left.
         y: pixel in the region from the bottom.
+        needs_splats: look for meshes only where there are splats, since Blender first builds a search tree of each.
 
     Returns:
         The nearest splats or mesh, or None.
@@ -50,6 +52,8 @@ def object_at(context: bpy.types.Context, x: float, y: float) -> Hit | None:
     seen = pick(placed, view, x + 0.5, view.height - y - 0.5)
     if seen is not None and seen.probability < MIN_PROBABILITY:
         seen = None
+    if seen is None and needs_splats:
+        return None
     obj, depth = _mesh_at(context, _meshes(context), view, x, y)
     if obj is not None and (seen is None or depth < seen.depth):
         collection = drawing.collections_by_part().get(obj)
@@ -139,12 +143,13 @@ def _without_floaters(mesh: bpy.types.Mesh, arrays: SplatArrays) -> Cloud:
 
 
 def _meshes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the visible mesh objects except splats, points and anchors."""
+    """Return the visible mesh objects except splats, points, anchors and those of which only lines are shown."""
     return [
         obj
         for obj in context.view_layer.objects
         if obj.type == "MESH"
         and scene.kind_of(obj) not in _SEE_THROUGH
+        and obj.display_type not in _LINES
         and not obj.hide_select
         and drawing.shown(obj, context.view_layer, context.space_data)
     ]

@@ -11,21 +11,30 @@ import numpy as np
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from gpu_extras.batch import batch_for_shader
 
-from .. import scene
+from .. import drawing, scene
+from ..drawing.splat_arrays import arrays_of
 
 REACH = 12.0
 """Distance from the cursor, in pixels, within which a point can be picked."""
 
+MIN_OPACITY = 0.3
+"""Fainter splats cannot be picked, since they are hardly seen and often far from any surface."""
+
 
 class PointPicker:
-    """Picker with the world positions of all visible vertices of a reconstruction, and the points picked so far."""
+    """Picker with the world positions of the points of a reconstruction, and the points picked so far.
 
-    def __init__(self, root: bpy.types.Collection) -> None:
+    They are the vertices and splats that a view layer shows in one of its viewports.
+    """
+
+    def __init__(
+        self, root: bpy.types.Collection, view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None
+    ) -> None:
         positions = [
             _world_positions(part)
             for collection in (root, *root.children_recursive)
             for part in collection.objects
-            if scene.kind_of(part) in ("points", "splats", "mesh") and part.visible_get()
+            if scene.kind_of(part) in ("points", "splats", "mesh") and drawing.shown(part, view_layer, space)
         ]
         self.positions = np.concatenate(positions) if positions else np.zeros((0, 3))
         self.picked = []
@@ -122,8 +131,12 @@ def nearest(positions: Any, perspective: Any, size: Any, mouse: Any, reach: floa
 
 
 def _world_positions(part: bpy.types.Object) -> Any:
-    """Return the vertices of an object's mesh in world coordinates, (N, 3) float64."""
-    local = np.empty(3 * len(part.data.vertices), np.float32)
-    part.data.vertices.foreach_get("co", local)
+    """Return the vertices or visible splats of an object in world coordinates, (N, 3) float64."""
+    arrays = arrays_of(part.data) if scene.kind_of(part) == "splats" else None
+    if arrays is not None:
+        local = arrays.means[arrays.opacities > MIN_OPACITY]
+    else:
+        local = np.empty((len(part.data.vertices), 3), np.float32)
+        part.data.vertices.foreach_get("co", local.reshape(-1))
     matrix = np.array(part.matrix_world)
-    return local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+    return local @ matrix[:3, :3].T + matrix[:3, 3]

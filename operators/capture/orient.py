@@ -38,7 +38,7 @@ class _PicksPoints:
         if context.area is None or context.area.type != "VIEW_3D":
             self.report({"ERROR"}, "Start this from a 3D viewport")
             return {"CANCELLED"}
-        self.picker = point_picker.PointPicker(need.active_root(context))
+        self.picker = point_picker.PointPicker(need.active_root(context), context.view_layer, context.space_data)
         if not self.picker.has_points:
             self.report({"ERROR"}, "There are no points to pick; show the points or splats of the reconstruction")
             return {"CANCELLED"}

@@ -72,10 +72,11 @@ class ClickObject(InViewport, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        return context.region_data is not None and context.mode == "OBJECT" and hit_test.draws_splats(context)
+        is_there = context.region_data is not None and context.mode == "OBJECT"
+        return is_there and hit_test.draws_splats(context) and scene.is_in_file()
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        hit = hit_test.object_at(context, event.mouse_region_x, event.mouse_region_y)
+        hit = hit_test.object_at(context, event.mouse_region_x, event.mouse_region_y, needs_splats=True)
         if hit is None or not hit_test.is_drawn(context, hit):
             return {"PASS_THROUGH"}
         _select(context, hit, self.toggle)
@@ -151,12 +152,13 @@ class PointAt(InViewport, bpy.types.Operator):
     _next = 0.0
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        began = time.monotonic()
+        began, was_labeled = time.monotonic(), pick_tool.is_pointing()
         if began >= PointAt._next:
             pick_tool.point_at(hit_test.object_at(context, event.mouse_region_x, event.mouse_region_y))
             now = time.monotonic()
             PointAt._next = now + _PAUSE * (now - began)
-        context.area.tag_redraw()
+        if was_labeled or pick_tool.is_pointing():
+            context.area.tag_redraw()
         return {"PASS_THROUGH"}
 
 
