@@ -16,6 +16,7 @@ from backend.raster.camera import Camera
 from backend.raster.reference import rasterize_reference
 from backend.shared.color.recolor import Recolor
 from backend.shared.reconstruction.objects import SceneObject
+from backend.shared.splats.convex_hull import points_inside
 from backend.shared.splats.spherical_harmonics import C0
 
 
@@ -173,6 +174,13 @@ def test_merged_object_follows_target():
 
 def test_removed_object_has_no_copies():
     assert 1 not in apply_edits(some_splats(), [scene_object(1, removed=True, copies=(rows(np.eye(4)),))]).object_ids
+
+
+def test_box_of_a_hull_is_tested_before_its_faces():
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)])
+    points = np.array([[0.5, 1.5, 2.5], [1.5, 1, 1], [0.5, -0.1, 1], [0.5, 1, 3.1], [1, 2, 3], [np.nan, 1, 1]])
+    everything = np.array([[0.0, 0, 0, -1]])
+    assert points_inside(points, corners, everything).tolist() == [True, False, False, False, True, False]
 
 
 def test_floaters_inside_hull_are_removed_on_request():
