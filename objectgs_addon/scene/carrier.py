@@ -101,12 +101,9 @@ def _sampled(mesh: bpy.types.Mesh) -> list[float]:
 def write(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:
     """Set a point attribute for all vertices; create it if it is missing or has another type or domain."""
     field, dtype, width = _FIELDS[kind]
-    attribute = mesh.attributes.get(name)
-    if attribute is not None and (attribute.data_type != kind or attribute.domain != "POINT"):
-        mesh.attributes.remove(attribute)
-        attribute = None
-    if attribute is None:
-        attribute = mesh.attributes.new(name, kind, "POINT")
+    if name in mesh.attributes and not has(mesh, name, kind):
+        mesh.attributes.remove(mesh.attributes[name])
+    attribute = mesh.attributes.get(name) or mesh.attributes.new(name, kind, "POINT")
     if len(values):
         flat = np.ascontiguousarray(values, dtype).reshape(-1)
         if flat.size != width * len(mesh.vertices):
