@@ -44,6 +44,17 @@ class Train(bpy.types.Operator):
                 confirm_text="Retrain",
                 icon="WARNING",
             )
+        state = folder_state(scene.folder_of(need.active_root(context)))
+        if state.trained and not state.steps:
+            self.restart = True
+            return context.window_manager.invoke_confirm(
+                self,
+                event,
+                title="Replace the Splats?",
+                message="There is no training that can go on, and a new one replaces the splats.",
+                confirm_text="Train",
+                icon="WARNING",
+            )
         return self.execute(context)
 
     @reports_errors

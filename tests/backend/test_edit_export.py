@@ -495,6 +495,12 @@ def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):
     assert [entry.name for entry in read_objects(made.objects)] == ["sphere 1", "sphere 2", "sphere 5"]
     assert len(read_vertices(made.points)) == len(scene.xyz)
     assert len(json.loads(made.cameras.read_text())["cameras"]) == 9
+    training = ("train", scene.folder, "--out", made.folder, "--steps", 1, "--offsets", 2)
+    before = made.splats.read_bytes()
+    assert_rejected(run_command(*training), "was imported from", "foreign.ply", "--restart")
+    assert made.splats.read_bytes() == before and not made.checkpoint.exists()
+    assert run_command(*training, "--restart").code == EXIT_DONE and made.splats.read_bytes() != before
+    assert run_command(*training).code == EXIT_DONE
 
 
 def test_import_without_masks_keeps_ids_of_file(run_command, write_capture, folder, tmp_path):

@@ -2,8 +2,10 @@
 """The plan in Blender: the panel, the user's overrides, and the arguments for training."""
 
 import argparse
+import dataclasses
 import json
 import shutil
+from types import SimpleNamespace
 
 import pytest
 
@@ -22,7 +24,8 @@ from objectgs.objectgs_addon.headless.arguments import parse
 from objectgs.objectgs_addon.panels.training.plan import PlanPanel
 from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.running import background
-from objectgs.objectgs_addon.state import planning
+from objectgs.objectgs_addon.state import folder_state, planning
+from objectgs.operators.training import train
 
 from .drawn import texts_of
 
@@ -100,6 +103,20 @@ def test_analyze_and_train_use_same_arguments(root, monkeypatch):
     wanted = tuple(planning.arguments(root))
     assert [words[0] for words in calls] == ["plan", "train"]
     assert all(words[-len(wanted) :] == wanted and "exposure" in words for words in calls)
+
+
+def test_training_that_replaces_splats_of_others_is_asked_about(root, monkeypatch):
+    asked, state = [], folder_state.folder_state(scene.folder_of(root))
+    manager = SimpleNamespace(invoke_confirm=lambda *_, **options: asked.append(options) or {"RUNNING_MODAL"})
+    context = SimpleNamespace(scene=bpy.context.scene, window_manager=manager)
+    for steps in (0, 100):
+        found = dataclasses.replace(state, trained=True, steps=steps)
+        monkeypatch.setattr(train, "folder_state", lambda _folder, found=found: found)
+        button = SimpleNamespace(restart=False, execute=lambda _: {"FINISHED"})
+        assert train.Train.invoke(button, context, None) == ({"FINISHED"} if steps else {"RUNNING_MODAL"})
+        assert button.restart is (steps == 0)
+    (options,) = asked
+    assert "a new one replaces the splats" in options["message"]
 
 
 def test_labels_file_groups_objects(root, tmp_path):

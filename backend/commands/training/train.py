@@ -85,6 +85,7 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
             "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
+    _check_not_imported(Reconstruction(options.out), options)
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
         _expect_training(budget, capture, device, TrainingProgress(), reporter)
@@ -254,6 +255,16 @@ def _affordable(
         f"{most:,} of them for more steps; more grow where they are missing"
     )
     return start(most_anchors=most)
+
+
+def _check_not_imported(folder: Reconstruction, options: argparse.Namespace) -> None:
+    """Raise InputError if a training would replace imported splats without being asked to."""
+    record = read_record(folder)
+    if record.imported is not None and record.training is None and folder.splats.exists() and not options.restart:
+        raise InputError(
+            f"{folder.splats} was imported from {record.imported.file}, and the training would replace it; use "
+            "--restart for that, or another --out."
+        )
 
 
 def _check_same_capture(folder: Reconstruction, capture: Capture, options: argparse.Namespace) -> None:
