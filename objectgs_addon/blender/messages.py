@@ -81,17 +81,22 @@ def withdraw(text: str) -> None:
     _messages[:] = [message for message in _messages if message.text != text]
 
 
-def settle(title: str, operator: str | None) -> None:
+def settle(title: str, operator: str | None, **options: Any) -> None:
     """Remove the messages about failures that a later success has settled.
 
     Args:
         title: title of the job that succeeded.
         operator: operator that the failures of such jobs offer, or None.
+        options: properties that the operator must have.
     """
     _messages[:] = [
         message
         for message in _messages
-        if message.operator is None or not (message.text.startswith(f"{title}: ") or message.operator == operator)
+        if message.operator is None
+        or not (
+            message.text.startswith(f"{title}: ")
+            or (message.operator == operator and options.items() <= message.options.items())
+        )
     ]
 
 

@@ -95,6 +95,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
             sources, self.cameras, self.frames or None, features=self.features, calibration=calibration
         )
         again = {"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(capture)}
+        messages.settle("", again["operator"], capture=again["capture"])
         if has_poses_of(capture, wanted):
             job = background.import_job(capture)
             need.require_unused(job.folder)

@@ -10,6 +10,7 @@ from bpy.props import IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.photos_source import PhotosSource, read_source
+from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background, results
 from ..common import need
@@ -65,6 +66,7 @@ class RecomputePoses(bpy.types.Operator):
             leave_out=[*source.leave_out, *json.loads(self.leave_out)],
             set=self.photo_set or source.set,
         )
+        messages.settle("", RecomputePoses.bl_idname, capture=self.capture)
         return background.submit(locations.sfm_job(capture, source), context.scene, self.report)
 
 

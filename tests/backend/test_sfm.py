@@ -61,6 +61,7 @@ def test_poses_are_those_of_the_photos(made, photos):
     assert report["points"] > 300 and report["reprojection_error"] < 0.6
     degrees, positions = pose_errors(made, ring())
     assert len(degrees) == VIEWS and np.median(degrees) < 0.3 and np.median(positions) < 0.01
+    assert report["files"] and photos_source.has_poses_of(made, photos_source.PhotosSource([photos]))
     assert (made / "masks" / "photo 1.png").exists() and (made / "labels.json").exists()
     for path in (photos / "images").iterdir():
         assert (made / "images" / path.name).read_bytes() == path.read_bytes()

@@ -3,7 +3,6 @@
 
 import json
 import os
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,9 +11,10 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 import objectgs as extension
-from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
+from objectgs.backend.shared.formats.photos_source import PhotosSource, digest_of_files, has_poses_of, write_source
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_record
+from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_photos
@@ -141,10 +141,8 @@ def computed(submitted, tmp_path):
     (capture / "sparse" / "0").mkdir(parents=True)
     (capture / "sfm").mkdir()
     write_source(capture, PhotosSource([tmp_path / "trip"], features="objects", leave_out=["1.jpg"]))
-    report = capture / "sfm" / "sfm.json"
-    report.write_text("{}")
-    newest = max(each.stat().st_ctime_ns for each in (tmp_path / "trip", *(tmp_path / "trip").iterdir()))
-    os.utime(report, ns=(newest, newest))
+    files = digest_of_files(PhotosSource([tmp_path / "trip"]), capture)
+    (capture / "sfm" / "sfm.json").write_text(json.dumps({"files": files}))
     return capture
 
 
@@ -163,9 +161,40 @@ def test_photos_with_poses_are_imported_as_they_are(submitted, computed, shown, 
     update_record(Reconstruction(job.folder), capture=CaptureRecord(str(computed), 800, "digest"))
     assert imported().command[-3:-1] == ["--max-size", "800"]
     assert imported(cameras="one").kind == "sfm"
-    time.sleep(0.05)
-    (tmp_path / "trip" / "c.jpg").write_bytes(b"")
-    assert imported().kind == "sfm"
+
+
+def test_only_changes_of_photos_count(submitted, computed, tmp_path):
+    folder = tmp_path / "trip"
+    wanted = PhotosSource([folder])
+    earlier = (folder / "b.jpg").stat().st_mtime_ns - 10**12
+    (folder / "earlier" / "sfm").mkdir(parents=True)
+    for name in (".DS_Store", "._b.jpg", "b.xmp", "earlier/sfm/source.json", "earlier/1.jpg"):
+        (folder / name).write_bytes(b"")
+    (folder / "notes.txt").write_bytes(b"more")
+    (folder / "b.jpg").chmod(0o600)
+    assert has_poses_of(computed, wanted)
+    (folder / "c.jpg").write_bytes(b"")
+    os.utime(folder / "c.jpg", ns=(earlier, earlier))
+    assert not has_poses_of(computed, wanted), "a photo that was taken before"
+    (folder / "c.jpg").unlink()
+    assert has_poses_of(computed, wanted)
+    os.utime(folder / "b.jpg")
+    assert not has_poses_of(computed, wanted)
+    (folder / "b.jpg").unlink()
+    assert not has_poses_of(computed, wanted)
+    (computed / "sfm" / "sfm.json").write_text("{}")
+    assert has_poses_of(computed, wanted), "as of an earlier version"
+
+
+def test_messages_about_earlier_poses_go_with_new_ones(submitted, computed, monkeypatch):
+    """Those of other captures stay."""
+    told = [
+        messages.Message("about", operator="objectgs.recompute_poses", options={"capture": str(capture), "set": 2})
+        for capture in (computed, computed.parent / "other")
+    ]
+    monkeypatch.setattr(messages, "_messages", list(told))
+    bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", capture=str(computed))
+    assert messages._messages == told[1:]
 
 
 def test_new_poses_for_a_training_are_asked_about(submitted, computed, shown, tmp_path, monkeypatch):

@@ -40,6 +40,7 @@ from ...shared.formats.photos_source import (
     VIDEOS,
     WORK,
     PhotosSource,
+    digest_of_files,
     read_source,
     write_source,
 )
@@ -161,6 +162,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         "global": ("Poses", 10.0), "incremental": ("Poses", 5.0), "refine": ("Poses", 2.0), "dense": ("Points", 10.0),
     })  # fmt: skip
     reporter.begin("photos", "Reading the photos")
+    files = digest_of_files(made_from, capture)
     lenses = () if made_from.calibration is None else read_calibration(made_from.calibration)
     photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter, lenses)
     if are_copied(made_from.photos, capture):
@@ -252,6 +254,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
             "figures": {name: own._asdict() for name, own in figures.items()},
             "weak": weak,
             "left_out": left_out,
+            "files": files,
             "seconds": round(time.monotonic() - started, 1),
         }
         write_json(work / REPORT, report)

@@ -15,7 +15,7 @@ from ...capture.mask_sources import MaskFiles
 from ...shared.errors import InputError
 from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import PHOTOS, SOURCE, VIDEOS, WORK, natural_order
+from ...shared.formats.photos_source import NOT_OF_USERS, PHOTOS, SOURCE, VIDEOS, WORK, natural_order
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StoppingReporter
 from .. import database
@@ -26,8 +26,6 @@ from .stamps import FILES, IMAGES, MASKS, Stamps
 FRAMES = "frames.json"
 """File in sfm/ with the frames that were taken of each video."""
 _READS_ALL_NAMES = os.name != "nt"
-_NOT_OF_USERS = (".", "@eaDir", "#recycle")
-"""How names of files and folders begin that computers put beside photos, such as thumbnails."""
 _LEAST_FREE = 1.2
 """Free space on the disk, relative to the size of the photos, below which they are not copied."""
 
@@ -289,7 +287,7 @@ def _listed(base: Path, masks: Path, capture: Path) -> list[Path]:
             path
             for path in paths
             if path.suffix.lower() in PHOTOS | VIDEOS
-            and not any(part.startswith(_NOT_OF_USERS) for part in path.relative_to(base).parts)
+            and not any(part.startswith(NOT_OF_USERS) for part in path.relative_to(base).parts)
             and path.is_file()
             and left_out.isdisjoint(path.parents)
             and (base.resolve().is_relative_to(inside) or not path.resolve().is_relative_to(inside))
