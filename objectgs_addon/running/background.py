@@ -38,8 +38,8 @@ INTERVAL = 0.1
 DRAW_EVERY = 1.0
 """Minimum time in seconds between two redraws for new figures."""
 _SHOWN_WARNINGS = 3
-_MARKING_GOES_ON = ("export", "film", "fill", "plan")
-"""Kinds of jobs that need little memory, and change no splats, points or masks."""
+_MARKING_GOES_ON = ("export", "fill", "plan")
+"""Kinds of jobs that take little memory or time, and change no splats, points or masks."""
 
 _REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "import": ("objectgs.import_capture", "Choose Another Folder...", {}),
@@ -104,7 +104,8 @@ def _end_marking(job: Job) -> None:
 
 
 def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
-    """Start a job that fills the holes behind removed objects, unless its result exists or the folder is not accepted.
+    """Start a job that fills the holes of removed and moved objects, unless its result exists or the folder is not
+    accepted.
 
     Args:
         root: the reconstruction's collection.
@@ -125,7 +126,7 @@ def fill_holes(root: bpy.types.Collection, again: bool = True) -> None:
         messages.show(text, "ERROR")
 
     if locations.backend_python() is None:
-        messages.show(f"Holes behind removed objects are not filled: {locations.backend_sentence()}", "ERROR")
+        messages.show(f"Holes of removed and moved objects are not filled: {locations.backend_sentence()}", "ERROR")
     else:
         submit(locations.backend_job(f"Fill of {root.name}", "fill", folder, "edit", str(folder)), owner, show_error)
 
@@ -297,8 +298,12 @@ def finish(job: Job) -> None:
     submitted_in = _submitted_in.pop(job, None)
     owner = next((owner for owner in bpy.data.scenes if owner.session_uid == submitted_in), None)
     show = _import_made if job.kind in ("demo", "sfm") else results.SHOW_BY_KIND.get(job.kind)
-    if show is not None and show(job, owner):
-        undo.push(job.title)
+    has_changed = show is not None  # What was shown before an error needs an undo step, too.
+    try:
+        has_changed = show is not None and show(job, owner)
+    finally:
+        if has_changed:
+            undo.push(job.title)
     pointing.show()  # A filled hole adds splats to those that are marked.
     if job.kind == "packages":
         _go_on(job, owner)

@@ -60,9 +60,9 @@ def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Coll
 
 
 def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Show a capture and, where they are not shown yet, the splats that were trained on it before."""
+    """Show a capture and, where they are not shown yet, the splats that were trained on it, not on other poses."""
     shown = _show_points(job, owner)
-    if not all(map(scene.object_collections, _shown_roots(job, owner))):
+    if not folder_state(_folder_of(job)).outdated and not all(map(scene.object_collections, _shown_roots(job, owner))):
         _show_result(job, owner)
     return shown
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Bad input and faults: one plain sentence for the user, and no damage to Blender's data or the folder."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -18,6 +19,7 @@ import headless
 bpy = pytest.importorskip("bpy")
 
 from objectgs import operators
+from objectgs.backend.shared.errors import InputError
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene
@@ -29,6 +31,7 @@ from objectgs.objectgs_addon.panels.training.train import TrainPanel
 from objectgs.objectgs_addon.process.jobs import Job, State
 from objectgs.objectgs_addon.running import background, handlers, results
 from objectgs.objectgs_addon.state import folder_trust, object_list
+from objectgs.objectgs_addon.state.folder_state import folder_state
 
 from .drawn import texts_of
 
@@ -651,6 +654,30 @@ def test_failed_result_does_not_stop_other_jobs(extension, folder, popups, tmp_p
     tick_until(lambda: works.is_finished and not background._results)
     assert broken.state is State.DONE and bpy.context.scene.objectgs.active is not None
     assert popups == ["Vote: the result could not be shown (ZeroDivisionError: on purpose)"]
+
+
+def imported(folder) -> Job:
+    """Return an import of a folder, which has ended."""
+    work = Job(title="Import", kind="import", folder=folder, command=[], cwd=folder)
+    background._submitted_in[work] = bpy.context.scene.session_uid
+    return work
+
+
+def test_points_of_splats_that_cannot_be_shown_are_an_undo_step(extension, folder, monkeypatch):
+    pushed = []
+    monkeypatch.setattr(background.undo, "push", pushed.append)
+    (folder / "splats.ply").write_bytes(b"damaged")
+    with pytest.raises(InputError, match=r"splats\.ply"):
+        background.finish(imported(folder))
+    assert bpy.context.scene.objectgs.active is not None and pushed == ["Import"]
+
+
+@pytest.mark.parametrize("is_outdated", [False, True])
+def test_import_shows_only_splats_of_its_poses(extension, folder, monkeypatch, is_outdated):
+    state = dataclasses.replace(folder_state(folder), outdated=is_outdated)
+    monkeypatch.setattr(results, "folder_state", lambda _folder: state)
+    background.finish(imported(folder))
+    assert bool(scene.object_collections(bpy.context.scene.objectgs.active)) is not is_outdated
 
 
 def test_folder_that_fails_does_not_stop_other_jobs(shown, folder, tmp_path, monkeypatch):

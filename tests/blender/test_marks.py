@@ -356,7 +356,7 @@ def test_marks_stay_in_the_viewport_while_their_objects_are_separated(root, sess
     assert not are_colored()
 
 
-@pytest.mark.parametrize(("kind", "goes_on"), [("export", True), ("fill", True), ("train", False), ("vote", False)])
+@pytest.mark.parametrize(("kind", "goes_on"), [("export", True), ("fill", True), ("train", False), ("film", False)])
 def test_jobs_end_the_marking_only_if_they_change_what_is_marked(root, session, monkeypatch, kind, goes_on):
     told = []
     monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
