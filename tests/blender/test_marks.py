@@ -650,4 +650,4 @@ def test_lines_of_strokes_have_a_dark_outline(monkeypatch):
 
 def test_splats_of_another_training_are_refused(session):
     session.take({"type": "answer", "ready": True, "splats": 7})
-    assert not session.ready and "train again" in session.failure
+    assert not session.ready and "train or separate again" in session.failure
