@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,8 +75,8 @@ class Views:
         scene: The scene with the cameras and photos.
         indices: The views to use.
         downscale: The factor by which renders are smaller than the photos.
-        memory_mb: Memory limit of the cache of renders. Object views are cached until other objects are requested,
-            scene maps permanently.
+        memory_mb: Memory limit of the cache of renders. Object views, and the scene maps used beside them, are cached
+            until other objects are requested; then the maps that were not used for longest make way for others.
     """
 
     def __init__(
@@ -91,7 +92,8 @@ class Views:
         self.indices = tuple(indices)
         self.downscale = downscale
         self._room = memory_mb * 1e6
-        self._maps: dict[int, SceneMap] = {}
+        self._maps: OrderedDict[int, SceneMap] = OrderedDict()
+        self._used: set[int] = set()
         self._views: dict[int, ObjectView | None] = {}
         self._classes: tuple[int, ...] = ()
         self._all: Generated | None = None
@@ -108,14 +110,16 @@ class Views:
 
     def scene_map(self, index: int) -> SceneMap:
         """Render the whole scene in view `index`."""
+        self._used.add(index)
         if index in self._maps:
+            self._maps.move_to_end(index)
             return self._maps[index]
         camera = self.camera(index)
         drawn = self._draw(self._scene_splats(camera), camera)
         ids, probability = (devices.host(plane) for plane in object_map(drawn))
         alpha = devices.host(drawn.alpha)
         found = SceneMap(camera, *self._depth(drawn), ids, probability, alpha)
-        if self._take(5 * alpha.nbytes):
+        if self._take(_bytes(found)):
             self._maps[index] = found
         return found
 
@@ -220,18 +224,20 @@ class Views:
         if classes != self._classes:
             self._room += sum(_bytes(view) for view in self._views.values() if view is not None)
             self._classes, self._views, self._own = classes, {}, None
+            self._used.clear()
 
     def _take(self, size: float) -> bool:
+        """Return whether a render of this size may be cached; unused scene maps make way for it."""
+        while size > self._room and self._maps and (oldest := next(iter(self._maps))) not in self._used:
+            self._room += _bytes(self._maps.pop(oldest))
         fits = size <= self._room
         if fits:
             self._room -= size
         return fits
 
 
-def _bytes(view: ObjectView) -> int:
-    return (
-        view.depth.nbytes + view.depth_uncertainty.nbytes + view.alpha.nbytes + view.color.nbytes + view.visible.nbytes
-    )
+def _bytes(render: SceneMap | ObjectView) -> int:
+    return sum(plane.nbytes for plane in vars(render).values() if isinstance(plane, np.ndarray))
 
 
 def _rectangle(splats: Generated, camera: Camera) -> tuple[int, int, int, int] | None:

@@ -177,6 +177,34 @@ def test_view_cache_respects_memory_limit():
     assert 0 < size <= 0.12e6
 
 
+def test_maps_are_rendered_once_for_each_object_and_kept_for_later_ones(monkeypatch):
+    cameras = [camera_at((4, 0.1 * i, 0)) for i in range(6)]
+    views = views_of(together(sheet(0.0, 1, half=0.3), sheet(1.0, 2, half=0.3)), cameras, memory_mb=0.25)
+    drawn = []
+    draw = Views._draw
+
+    def counted(self, splats, camera):
+        drawn.append(camera)
+        return draw(self, splats, camera)
+
+    monkeypatch.setattr(Views, "_draw", counted)
+
+    def rendered_for(object_class, indices):
+        """Return the number of renders of the whole scene, asked for twice, as for a mesh."""
+        drawn.clear()
+        for _ in range(2):
+            for i in indices:
+                views.object_view(i, [object_class])
+                views.scene_map(i)
+        return sum(any(camera is each for each in cameras) for camera in drawn)
+
+    assert rendered_for(2, (0, 1, 2)) == 3
+    assert rendered_for(1, (2, 3, 4)) == 2
+    assert rendered_for(2, (3, 4, 5)) == 1
+    held = [*views._maps.values(), *views._views.values()]
+    assert sum(p.nbytes for v in held for p in vars(v).values() if isinstance(p, np.ndarray)) <= 0.25e6
+
+
 # --- shapes that are seen exactly ------------------------------------------------------------------------------------
 
 

@@ -30,7 +30,7 @@ from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.meshes import MeshEntry, read_meshes, read_waiting, write_meshes
 from ...shared.reconstruction.objects import default_name, find_object, members_of, read_objects, shown_as
 from ...shared.stopping import StoppingReporter
-from ..folder import READ, Trained, locked_reconstruction, open_trained, with_corrected_masks
+from ..folder import READ, Trained, locked_reconstruction, memory_for_targets, open_trained, with_corrected_masks
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
 from ..setup.kernels import ensure_kernels, kernel_seconds
@@ -47,6 +47,8 @@ part may lie, relative to their extent."""
 _PROGRESS_FRACTIONS = {"fuse": 0.4, "extract": 0.1, "refine": 0.2, "unwrap": 0.1, "bake": 0.2}
 """Fractions of the time of one mesh, for the progress."""
 _SECONDS_A_MESH = 15.0
+_FOR_RENDERS = 0.75
+"""Fraction of the memory for targets that renders of the model take."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,10 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         if len(wanted) < len(targets):
             reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
         started = time.monotonic()
-        views = Views(model, trained.scene, trained.capture.train_indices)
+        # Renders and photos share the memory; a pixel takes about four times as many bytes in the former.
+        trained.scene.forget(1 - _FOR_RENDERS)
+        renders = _FOR_RENDERS * memory_for_targets(options)
+        views = Views(model, trained.scene, trained.capture.train_indices, memory_mb=renders)
         for done, target in enumerate(wanted):
             reporter.status(f"Making the mesh of {target.name} ({done + 1} of {len(wanted)})")
             entry = _make(target, options, trained, views, _Part(reporter, done, len(wanted), started))
