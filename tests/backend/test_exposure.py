@@ -51,6 +51,19 @@ def test_occluded_points_are_ignored():
     np.testing.assert_allclose(measure_gains(views), truth / np.exp(np.log(truth).mean(0)), rtol=0.1)
 
 
+def test_few_of_many_observations_suffice(monkeypatch):
+    truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
+    views = photos(truth, [1] * 8, points=1000, noise=0.01)
+    whole, used = measure_gains(views), []
+    bincount = np.bincount
+    monkeypatch.setattr(np, "bincount", lambda x, *args, **options: used.append(x) or bincount(x, *args, **options))
+    monkeypatch.setattr("backend.training.exposure.gains._MOST_OBSERVATIONS", 3000)
+    found = measure_gains(views)
+    np.testing.assert_allclose(found, whole, rtol=0.01)
+    # The same points in all views.
+    assert all(len(points) == 2000 and (bincount(points)[::4] == 8).all() for points in used)
+
+
 def test_equal_photos_have_no_exposure_variation():
     assert not varies(measure_gains(photos(np.ones((8, 3)), [1] * 8, noise=0.02)))
 

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 VARIES_FROM = 0.02
 """Standard deviation of the log gains above which the exposure is considered to vary."""
 
+_MOST_OBSERVATIONS = 5_000_000
+"""Number of observations, each of which takes about 120 bytes, above which every other point is left out repeatedly."""
+
 _ROUNDS = 10
 _MIN_OBSERVATIONS = 30
 _LIMIT = 4.0
@@ -42,10 +45,16 @@ def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
         InputError: an image cannot be read.
     """
     gains = np.ones((len(capture.views), 3))
-    observed = {}
+    observed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    every, held = 1, 0
     for i in capture.train_indices:
         check()
-        observed[i] = _observations(capture, i)
+        observed[i] = _observations(capture, i, every)
+        held += len(observed[i][0])
+        while held > _MOST_OBSERVATIONS:
+            every *= 2
+            observed = {view: _of_every(every, *found) for view, found in observed.items()}
+            held = sum(len(points) for points, _ in observed.values())
     known = [i for i, (points, _) in observed.items() if len(points) >= _MIN_OBSERVATIONS]
     if len(known) < 2:
         return gains
@@ -99,13 +108,22 @@ def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
     return found
 
 
-def _observations(capture: Capture, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points observed in a view: indices (n,), and colors (n, 3) in [0, 1], averaged over 3 x 3 pixels."""
+def _of_every(every: int, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices (n,) and colors (n, 3) of the points whose index is a multiple of `every`."""
+    kept = points % every == 0
+    return points[kept], colors[kept]
+
+
+def _observations(capture: Capture, index: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points observed in a view: indices (n,), and colors (n, 3) in [0, 1], averaged over 3 x 3 pixels.
+
+    Only those whose index is a multiple of `every`.
+    """
     keypoints = capture.keypoints(index)
     pixels = capture.image(index)
     height, width = pixels.shape[:2]
     x, y = np.floor(keypoints.xy).astype(np.int64).T
-    inside = (x >= 1) & (y >= 1) & (x < width - 1) & (y < height - 1)
+    inside = (x >= 1) & (y >= 1) & (x < width - 1) & (y < height - 1) & (keypoints.point_index % every == 0)
     x, y = x[inside], y[inside]
     color = np.zeros((len(x), 3))
     for dx in (-1, 0, 1):
