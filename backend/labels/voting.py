@@ -119,11 +119,12 @@ def vote(
         reporter.progress(done, len(indices), what="views")
     if occlusion and strategy != "correspondence" and not ballots.visible.all():
         # Points that the occlusion test hides from every view are voted on without it.
-        silent = ballots.visible == 0
+        silent = np.flatnonzero(ballots.visible == 0)
+        hidden = np.ascontiguousarray(xyz[:, silent])
         for index in indices:
-            points, x, y = find_visible_points(capture, xyz, index, None)
-            keep = silent[points]
-            cast(index, points[keep], x[keep], y[keep])
+            reporter.check()
+            points, x, y = find_visible_points(capture, hidden, index, None)
+            cast(index, silent[points], x, y)
     chosen, margins = ballots.count(np.random.default_rng(seed) if strategy == "probability" else None)
     ids = classes.ids_of(chosen)
     won = np.bincount(chosen[chosen >= 0], minlength=len(classes))

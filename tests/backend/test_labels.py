@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from backend.capture import Keypoints, Points, View, load_capture
-from backend.labels import read_points, vote, write_points
+from backend.labels import read_points, vote, voting, write_points
 from backend.labels.voting import _Ballots, needed_to_be_unlabeled
 from backend.shared.errors import InputError
 from backend.shared.events import Reporter
@@ -170,6 +170,25 @@ def test_correspondence_uses_only_observations():
     capture = given(masks, [[0, 0, 1.0], [0.1, 0, 1.0]], seen=[np.array([0]), np.array([1]), np.array([1, 1])])
     votes = vote(capture, "correspondence")
     assert votes.ids.tolist() == [1, 2] and votes.visible.tolist() == [1, 2]
+
+
+def test_only_points_without_votes_are_projected_again(monkeypatch):
+    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(40) + 0.5)
+    wall = np.stack([(x.ravel() - 20) / 8, (y.ravel() - 20) / 8, np.ones(1600)], 1)
+    xyz = np.concatenate([wall, [[0.0, 0.0, 4.0]]])
+    projected, checks = [], []
+    project = voting.find_visible_points
+
+    def find(capture, positions, *others):
+        projected.append((positions.shape[1], len(checks)))
+        return project(capture, positions, *others)
+
+    reporter = Reporter()
+    reporter.check = lambda: checks.append(0)
+    monkeypatch.setattr(voting, "find_visible_points", find)
+    votes = vote(given([np.full((40, 40), 1), np.full((40, 40), 2)], xyz), reporter=reporter)
+    assert votes.visible[-1] == 2
+    assert projected == [(1601, 0), (1601, 0), (1, 1), (1, 2)]
 
 
 def test_occlusion_ignores_hidden_views_except_observations():
