@@ -101,7 +101,7 @@ def add_length(command: argparse.ArgumentParser) -> None:
 def add_checkpoint_seconds(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--checkpoint-seconds", type=types.amount, default=30.0, metavar="S",
-        help="time between checkpoints in seconds (30)",
+        help="least time between checkpoints in seconds; more if they take long to write (30)",
     )  # fmt: skip
 
 

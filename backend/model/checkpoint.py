@@ -29,6 +29,9 @@ _TYPES: dict[np.dtype[Any], str] = {
 
 _DTYPES: dict[str, np.dtype[Any]] = {name: dtype for dtype, name in _TYPES.items()}
 
+_SHARE, _LONGEST = 20.0, 600.0
+"""Seconds between two checkpoints for each second that one takes, and their limit."""
+
 Tensors = dict[str, np.ndarray]
 Check = Callable[[Mapping[str, np.ndarray], dict[str, Any]], None]
 
@@ -144,6 +147,11 @@ def _write(file: BinaryIO, tensors: dict[str, np.ndarray], metadata: dict[str, s
     file.write(len(encoded).to_bytes(LENGTH_BYTES, "little") + encoded)
     for name in order:
         file.write(tensors[name].data)
+
+
+def seconds_to_next(least: float, saving: float) -> float:
+    """Return the seconds to train until the next checkpoint: `least`, or more if the last one took long to save."""
+    return max(least, min(_SHARE * saving, _LONGEST))
 
 
 def has_checkpoint(folder: Path) -> bool:

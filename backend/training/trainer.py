@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..model.checkpoint import save_checkpoint
+from ..model.checkpoint import save_checkpoint, seconds_to_next
 from ..model.object_model import ObjectModel
 from ..raster import devices
 from ..shared.durations import awake_seconds
@@ -220,9 +220,7 @@ class Trainer:
         stop: StopRequest | None = None,
         checkpoint_seconds: float = CHECKPOINT_SECONDS,
     ) -> None:
-        """Train until the budget is spent.
-
-        Pauses do not count as training time.
+        """Train until the budget is spent; pauses do not count.
 
         Args:
             budget: total length of the training.
@@ -230,7 +228,7 @@ class Trainer:
             reporter: receives progress, quality and warnings.
             evaluate: function that measures the model on held-out and validation views, and may leave out the former.
             stop: stop and pause request, checked before each step.
-            checkpoint_seconds: interval between checkpoints.
+            checkpoint_seconds: least time between checkpoints; more if they take long to write.
 
         Raises:
             Cancelled: a stop was requested; the training is saved.
@@ -264,7 +262,7 @@ class Trainer:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
         started = last_saved = last_report = awake_seconds()
-        parts = self.parts
+        parts, until_next = self.parts, checkpoint_seconds
         while True:
             p.seconds = before + awake_seconds() - started
             if evaluate is not None and budget.evaluation_is_due(p):
@@ -305,9 +303,10 @@ class Trainer:
                 p.seconds = before + now - started
                 self._report(budget, reporter, float(self._smooth), (now - started) / (p.step - first_step))
                 self.optimizer.check.watch()
-            if now - last_saved >= checkpoint_seconds:
+            if now - last_saved >= until_next:
                 self.save(checkpoints)
                 last_saved = awake_seconds()
+                until_next = seconds_to_next(checkpoint_seconds, last_saved - now)
         self.save(checkpoints)
         if p.skipped:
             reporter.warning(f"{p.skipped} updates were not finite and were skipped{p.causes and f': {p.causes}'}.")

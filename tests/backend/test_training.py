@@ -18,7 +18,7 @@ import torch
 from backend.commands.setup import machine
 from backend.commands.training import memory
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
-from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint
+from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint, seconds_to_next
 from backend.model.draw import draw
 from backend.model.generate import generate
 from backend.model.growth import MIN_VISITS, GrowthStatistics, grow_and_prune
@@ -513,6 +513,20 @@ def test_training_lowers_loss_and_learns_ids(tiny, settings):
     truth = capture.mask(index)
     assert (rendered.ids[truth > 0] == truth[truth > 0]).mean() > 0.95
     assert rendered.probability[truth > 0].mean() > 0.85
+
+
+def test_checkpoints_that_take_long_are_rare(tiny, tmp_path, monkeypatch):
+    trainer, saved = Trainer.start(*tiny(), SMALL), []
+
+    def save(folder):
+        saved.append(trainer.progress.step)
+        time.sleep(0.5)
+
+    monkeypatch.setattr(trainer, "save", save)
+    trainer.run(Budget(steps=6), tmp_path, Reporter(), checkpoint_seconds=0.0)
+    assert saved == [1, 6]
+    assert [seconds_to_next(30.0, seconds) for seconds in (0.1, 10.0, 100.0)] == [30.0, 200.0, 600.0]
+    assert seconds_to_next(1000.0, 100.0) == 1000.0
 
 
 def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
