@@ -206,6 +206,8 @@ def texture_score(
     vertices = scene.normalization.to_scene(mesh.vertices)
     classes = None if ids is None else scene.classes.classes_among(ids)
     for index in indices:
+        if ids is not None and set(ids).isdisjoint(scene.capture.ids_in(index)):
+            continue
         photo, labels = scene.target(index)
         if classes is None:
             wanted = np.ones(photo.shape[1:], bool)

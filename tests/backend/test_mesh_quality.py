@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import replace
 from fractions import Fraction
+from types import SimpleNamespace
 
 import manifold3d
 import numpy as np
@@ -363,13 +364,20 @@ class FakeScene:
     normalization = Normalization((10.0, 0.0, 0.0), 0.5)
 
     def __init__(self, photos, labels):
-        self.photos, self.labels = photos, labels
+        self.photos, self.labels, self.read = photos, labels, []
+        self.capture = SimpleNamespace(ids_in=self.ids_in)
+
+    def ids_in(self, index):
+        if self.labels[index] is None:
+            return ()
+        return tuple(self.classes.ids_of(np.unique(self.labels[index])).tolist())
 
     def camera(self, index):
         height, width = self.photos[index].shape[:2]
         return Camera(np.eye(4), np.array([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]]), width, height)
 
     def target(self, index):
+        self.read.append(index)
         photo = torch.from_numpy(self.photos[index].transpose(2, 0, 1).astype(np.float32))
         return photo, None if self.labels[index] is None else torch.from_numpy(self.labels[index])
 
@@ -413,6 +421,12 @@ def test_texture_psnr_uses_only_masked_pixels(monkeypatch):
     bands = texture_score(poster(), texture, FakeScene([photo], [None]), None, [0])
     assert (bands.pixels, bands.covered) == (whole.pixels, whole.covered)
     assert bands.squares == pytest.approx(whole.squares, rel=1e-6)
+
+
+def test_photos_whose_masks_lack_the_object_are_not_read():
+    scene = FakeScene([photo] * 4, [np.full((30, 40), 1), np.full((30, 40), 2), None, np.zeros((30, 40), int)])
+    assert texture_score(poster(), texture, scene, [4], range(4)).pixels == 1200 and scene.read == [0]
+    assert texture_score(poster(), texture, scene, None, range(4)).pixels == 4800 and scene.read == [0, 0, 1, 2, 3]
 
 
 def test_holes_lower_texture_coverage():
