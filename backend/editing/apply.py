@@ -28,20 +28,23 @@ _DROPPED = -1
 _SMALLEST_SCALE = float(np.finfo(np.float32).tiny)
 
 
-def apply_edits(splats: Splats, objects: Sequence[SceneObject]) -> Splats:
+def apply_edits(splats: Splats, objects: Sequence[SceneObject], reporter: Reporter | None = None) -> Splats:
     """Apply the user's edits: remove, fill holes, clean floaters, recolor, transform and duplicate.
 
     Args:
         splats: The captured splats.
         objects: The objects with their edits; splats with other IDs do not change.
+        reporter: Receives the progress of filling holes; its check ends the work once the user wants to stop.
 
     Returns:
         The edited splats. Splats of a merged object have the ID of the object that it is merged into, whose edits count
         for both. Duplicates have the ID of the original and come last.
     """
-    edited = _remove_and_fill(splats, objects)[0]
+    reporter = reporter or Reporter()
+    edited = _remove_and_fill(splats, objects, reporter)[0]
     copies = []
     for entry in objects:
+        reporter.check()
         mine = np.flatnonzero(edited.object_ids == entry.id)
         if len(mine) == 0 or not (entry.recolor or entry.transform or entry.copies):
             continue
@@ -76,7 +79,7 @@ def compute_fill(splats: Splats, objects: Sequence[SceneObject], reporter: Repor
 
     reporter: receives the progress.
     """
-    return _remove_and_fill(splats, objects, reporter)[1]
+    return _remove_and_fill(splats, objects, reporter or Reporter())[1]
 
 
 def transformed(splats: Splats, matrix: ArrayLike) -> Splats:
@@ -120,14 +123,13 @@ def recolored(splats: Splats, recolor: Recolor) -> Splats:
     return replace(splats, sh=sh.astype(splats.sh.dtype))
 
 
-def _remove_and_fill(
-    splats: Splats, objects: Sequence[SceneObject], reporter: Reporter | None = None
-) -> tuple[Splats, Fill]:
+def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject], reporter: Reporter) -> tuple[Splats, Fill]:
     """Return the visible splats, with the IDs that they are shown as and with filled holes, and the filling itself."""
     known, slots = np.unique(splats.object_ids, return_inverse=True)
     shown = _visible_as(known, objects)[slots]
     keep = shown != _DROPPED
     for entry in objects:
+        reporter.check()
         if entry.removed and entry.floaters:
             keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
         if entry.cleaned:
@@ -136,7 +138,6 @@ def _remove_and_fill(
     edited = replace(splats.select(keep), object_ids=shown[keep])
     fills = np.zeros(len(edited), np.int64)
     taken: list[tuple[Splats, int]] = []
-    reporter = reporter or Reporter()
     filled = [entry for entry in objects if entry.fill]
     for done, entry in enumerate(filled):
 

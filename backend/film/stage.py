@@ -49,7 +49,7 @@ class Stage:
         self._device = device
         self._digest = _digest_of(folder, objects, primitive)
         self._entries = {entry.id: entry for entry in objects}
-        edited = apply_edits(splats, [replace(entry, transform=None, copies=()) for entry in objects])
+        edited = apply_edits(splats, [replace(entry, transform=None, copies=()) for entry in objects], reporter)
         self.classes = ClassTable(edited.object_ids)
         ids, slots = self.classes.ids, self.classes.classes_of(edited.object_ids)
         self.names = _names(ids.tolist(), self._entries)

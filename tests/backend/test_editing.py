@@ -15,6 +15,8 @@ from backend.model.splats import Splats, concatenate
 from backend.raster.camera import Camera
 from backend.raster.reference import rasterize_reference
 from backend.shared.color.recolor import Recolor
+from backend.shared.errors import Cancelled
+from backend.shared.events import Reporter
 from backend.shared.reconstruction.objects import SceneObject
 from backend.shared.splats.convex_hull import points_inside
 from backend.shared.splats.spherical_harmonics import C0
@@ -335,6 +337,27 @@ def test_compute_fill_matches_applied_edits():
     taken = fill.splats.select(~fill.put)
     still = kept.select(~np.isin(kept.means, taken.means).all(1))
     assert len(taken) and same(still, edited.select(~edited.unobserved))
+
+
+def test_filling_of_applied_edits_can_be_followed_and_stopped():
+    splats, _ = with_box_on_ground()
+    objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
+
+    class Recording(Reporter):
+        def __init__(self):
+            self.seen = []
+
+        def progress(self, done, total, **_):
+            self.seen.append(done / total)
+
+        def check(self):
+            if len(self.seen) > 1:
+                raise Cancelled("")
+
+    reporter = Recording()
+    with pytest.raises(Cancelled):
+        apply_edits(splats, objects, reporter)
+    assert reporter.seen == sorted(reporter.seen) and reporter.seen[-1] == 1
 
 
 def test_no_fill_without_surrounding_surface():

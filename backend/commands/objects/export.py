@@ -46,7 +46,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.warning(sentence)
     _warn_about_fit(folder, record, reporter)
     reporter.begin("edit", "Applying the edits")
-    splats = apply_edits(captured, objects)
+    splats = apply_edits(captured, objects, reporter)
     if chosen:
         splats = splats.select(np.isin(splats.object_ids, chosen))
     if len(splats) == 0:
