@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..shared.stopping import Check, proceed
+
 if TYPE_CHECKING:
     from ..capture import Capture
 
@@ -34,10 +36,11 @@ def extent_of(capture: Capture) -> Extent:
     return Extent(center, float(np.percentile(distances, _PERCENTILE)) if len(distances) else 1.0)
 
 
-def pixel_size(capture: Capture) -> float:
+def pixel_size(capture: Capture, check: Check = proceed) -> float:
     """Return the median side of a pixel at the points that it shows, in world units; infinite if none shows any."""
     xyz, sizes = capture.points.xyz, []
     for index in np.unique(np.linspace(0, len(capture.views) - 1, min(len(capture.views), _VIEWS)).astype(int)):
+        check()
         view = capture.views[index]
         local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
         sizes.append(local[view.pixels_of(local)[0], 2] / view.K[0, 0])

@@ -24,12 +24,12 @@ from ..shared.durations import awake_seconds
 from ..shared.errors import Cancelled, InputError, ProcessLost
 from ..shared.events import Reporter
 from ..shared.reconstruction.objects import default_name
-from ..shared.stopping import StopRequest
+from ..shared.stopping import Check, StopRequest, proceed
 from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress, objective_of, plateau_end
 from .cells.region import Region
 from .exposure.photo_colors import begin_colors
-from .initial_model import DistantPoints, initial_model
+from .initial_model import DistantPoints, Detail, initial_model
 from .optimizer.model_optimizer import ModelOptimizer
 from .processes.shared_views import Outcome, SharedViews
 from .processes.team import Order, Processes, Team
@@ -100,6 +100,8 @@ class Trainer:
         more: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
         surroundings: DistantPoints | None = None,
         most_anchors: int | None = None,
+        detail: Detail | None = None,
+        check: Check = proceed,
     ) -> Trainer:
         """Start a training with anchors at the capture's points.
 
@@ -107,18 +109,17 @@ class Trainer:
             capture: the views and points.
             point_ids: (M,) int64 object ID of each point, 0 if it belongs to none.
             settings: settings of the training.
-            memory_mb: memory limit for cached targets.
+            memory_mb, gains: as in `Scene`.
             device: device to train on.
-            seeds, more, surroundings, most_anchors: as in `initial_model`; seeds may be None for all points.
+            seeds: as in `initial_model`, as the arguments from `more` on; None: all points.
             supervise_background: as in `Scene`; None: decided by `background_is_masked` for the points without object.
-            gains: as in `Scene`.
 
         Raises:
             InputError: an image cannot be read.
         """
         rng = np.random.default_rng(settings.seed)
         seeds = np.ones(len(capture.points.xyz), np.bool_) if seeds is None else seeds
-        model = initial_model(capture, point_ids, settings, rng, seeds, more, surroundings, most_anchors)
+        model = initial_model(capture, point_ids, settings, rng, seeds, more, surroundings, most_anchors, detail, check)
         if supervise_background is None:
             supervise_background = capture.has_masks and background_is_masked(point_ids[seeds] == 0)
         scene = Scene(

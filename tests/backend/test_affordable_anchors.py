@@ -53,6 +53,26 @@ def test_points_are_thinned_evenly_and_cells_stay_fine(write_capture, tmp_path):
     assert len(octants) == 8 and octants.min() > 0.7 * octants.mean()
 
 
+def test_thinning_keeps_the_first_point_of_an_object_in_each_cell():
+    rows = np.random.default_rng(0).integers(-3, 3, (2000, 4))
+    assert np.array_equal(initial_model._first_of_each(rows), np.unique(rows, axis=0, return_index=True)[1])
+
+
+def test_detail_that_is_known_is_not_measured_again(tiny, monkeypatch):
+    capture, ids = tiny()
+    seeds, checks = np.ones(len(ids), bool), []
+    known = initial_model.measure_detail(capture, seeds, check=lambda: checks.append(0))
+    assert len(checks) == len(capture.views)
+    first = Trainer.start(capture, ids, SMALL, most_anchors=50).model.anchors
+    monkeypatch.delattr(initial_model, "measure_detail")
+    checks.clear()
+    again = Trainer.start(
+        capture, ids, SMALL, most_anchors=50, detail=known, check=lambda: checks.append(0)
+    ).model.anchors  # fmt: skip
+    assert torch.equal(first.rows, again.rows) and torch.equal(first.positions, again.positions)
+    assert checks
+
+
 def test_measuring_a_step_changes_nothing(tiny):
     capture, ids = tiny()
     trainer, same = (Trainer.start(capture, ids, Settings(offsets=2, fit_colors=True)) for _ in range(2))

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from scipy.spatial import cKDTree
 
 from backend.commands.setup import machine
 from backend.commands.training import memory
@@ -488,6 +489,23 @@ def test_finest_cells_are_no_larger_than_two_pixels(tiny):
     for seeds, expected in ((np.ones(len(ids), bool), median_spacing(xyz)), (few, finest)):
         model = initial_model(capture, ids, SMALL, np.random.default_rng(0), seeds)
         assert model.anchors.voxel / model.normalization.scale == pytest.approx(expected)
+
+
+def test_spacing_of_many_points_is_that_of_a_sample(monkeypatch):
+    xyz = np.random.default_rng(0).normal(size=(20_000, 3))
+    queried, query = [], cKDTree.query
+
+    class Counting(cKDTree):
+        def query(self, points, k):
+            queried.append(len(points))
+            return query(self, points, k)
+
+    monkeypatch.setattr("backend.model.anchors.cKDTree", Counting)
+    monkeypatch.setattr("backend.model.anchors._QUERIED", 20_000)
+    whole = median_spacing(xyz)
+    monkeypatch.setattr("backend.model.anchors._QUERIED", 3000)
+    assert median_spacing(xyz) == pytest.approx(whole, rel=0.03)
+    assert queried == [20_000, 20_000 // 7 + 1]
 
 
 def test_pixels_are_measured_where_they_show_points(tiny):

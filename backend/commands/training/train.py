@@ -27,7 +27,7 @@ from ...shared.reconstruction.plan import Plan, write_plan
 from ...shared.reconstruction.record import TrainingRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
 from ...training.budget import Budget, TrainingProgress
-from ...training.initial_model import FEWEST_ANCHORS, DistantPoints, affordable_anchors
+from ...training.initial_model import FEWEST_ANCHORS, DistantPoints, affordable_anchors, measure_detail
 from ...training.processes.team import Order, Team, choose_gpu, connect, is_follower, processes, processes_here
 from ...training.trainer import Trainer
 from ..exported import EXPORT, export_model
@@ -201,9 +201,12 @@ def _begin(
     else:
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
         seeds, more = starting_points(planned, context.point_ids, plan, options.seed, reporter)
+        # Once for both trainers that may be started.
+        detail = measure_detail(planned, seeds, more, reporter.check)
         start = functools.partial(
             Trainer.start, planned, context.point_ids, wanted, memory, device, seeds=seeds,
             supervise_background=planned.has_masks and plan.does("rest"), gains=gains, more=more, surroundings=far,
+            detail=detail, check=reporter.check,
         )  # fmt: skip
         trainer = start()
         if not budget.until_converged and device.type == "cpu" and wanted.mode != "paper" and wanted.voxel is None:
