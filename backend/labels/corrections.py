@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from ..capture import Capture
+from ..shared.class_table import ClassTable
 from ..shared.stopping import Check, proceed
 from .voting import find_observed_points
 
@@ -167,10 +168,12 @@ def _regions(capture: Capture, index: int, point_ids: np.ndarray) -> Iterator[Re
     at, ids = mask[y, x], point_ids[points]
     found, doubts = np.unique(at[(at > 0) & (at != ids)], return_counts=True)
     # With fewer, no region of enough points is wrong.
-    for object_id in found[doubts >= _ENOUGH_POINTS * _OTHER].tolist():
-        shown = mask == object_id
-        own = ndimage.find_objects(shown.view(np.uint8))[0]
-        numbers, _ = ndimage.label(shown[own])
+    doubted = ClassTable(found[doubts >= _ENOUGH_POINTS * _OTHER])
+    if not len(doubted):
+        return
+    windows = ndimage.find_objects(doubted.classes_of(mask) + 1)
+    for object_id, own in zip(doubted.ids.tolist(), windows, strict=True):
+        numbers, _ = ndimage.label(mask[own] == object_id)
         mine = at == object_id
         rows, columns, its = y[mine] - own[0].start, x[mine] - own[1].start, ids[mine]
         number = numbers[rows, columns]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 from backend.capture import load_capture
 from backend.labels import correct_masks, vote
@@ -65,6 +66,21 @@ def test_exchanged_ids_are_exchanged_back(scene, tmp_path):
     for other in capture.train_indices:
         if other != index:
             assert np.array_equal(corrected.mask(other), capture.mask(other))
+
+
+def test_objects_of_a_mask_are_found_at_once(scene, tmp_path, monkeypatch):
+    index = load_capture(scene.folder, tmp_path / "cache").train_indices[3]
+    rewrite(mask_path(scene, index), exchange)
+    capture, ids = loaded(scene, tmp_path, "again")
+    whole, find = [], ndimage.find_objects
+
+    def counting(labels, *args):
+        whole.append(labels.shape == capture.mask(index).shape)
+        return find(labels, *args)
+
+    monkeypatch.setattr(ndimage, "find_objects", counting)
+    assert correct_masks(capture, ids, ignore_gaps=False)[1] == 2
+    assert sum(whole) == 1
 
 
 @pytest.mark.parametrize("memory_mb", [2000, 0])
