@@ -29,7 +29,7 @@ from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress, objective_of, plateau_end
 from .cells.region import Region
 from .exposure.photo_colors import begin_colors
-from .initial_model import DistantPoints, Detail, initial_model
+from .initial_model import Detail, DistantPoints, initial_model
 from .optimizer.model_optimizer import ModelOptimizer
 from .processes.shared_views import Outcome, SharedViews
 from .processes.team import Order, Processes, Team
