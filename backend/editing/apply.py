@@ -44,10 +44,10 @@ def apply_edits(splats: Splats, objects: Sequence[SceneObject], reporter: Report
     edited = _remove_and_fill(splats, objects, reporter)[0]
     copies = []
     for entry in objects:
-        reporter.check()
         mine = np.flatnonzero(edited.object_ids == entry.id)
         if len(mine) == 0 or not (entry.recolor or entry.transform or entry.copies):
             continue
+        reporter.check()
         own = edited.select(mine)
         if entry.recolor:
             own = recolored(own, entry.recolor)
@@ -129,10 +129,11 @@ def _remove_and_fill(splats: Splats, objects: Sequence[SceneObject], reporter: R
     shown = _visible_as(known, objects)[slots]
     keep = shown != _DROPPED
     for entry in objects:
-        reporter.check()
         if entry.removed and entry.floaters:
+            reporter.check()
             keep &= ~_floaters(splats, _with_id(splats, entry.id, objects))
         if entry.cleaned:
+            reporter.check()
             mine = np.flatnonzero(shown == entry.id)
             keep[mine[floating(splats.means[mine])]] = False
     edited = replace(splats.select(keep), object_ids=shown[keep])

@@ -342,22 +342,19 @@ def test_compute_fill_matches_applied_edits():
 def test_filling_of_applied_edits_can_be_followed_and_stopped():
     splats, _ = with_box_on_ground()
     objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
+    seen, checks = [], []
+    reporter = Reporter()
+    reporter.progress = lambda done, total, **_: seen.append(done / total)
+    reporter.check = lambda: checks.append(0)
+    apply_edits(splats, [*objects, scene_object(5, recolor=Recolor(hue=0.1))], reporter)
+    assert seen == sorted(seen) and seen[-1] == 1 and len(checks) == 1
 
-    class Recording(Reporter):
-        def __init__(self):
-            self.seen = []
+    def stop(done, total, **_):
+        raise Cancelled("")
 
-        def progress(self, done, total, **_):
-            self.seen.append(done / total)
-
-        def check(self):
-            if len(self.seen) > 1:
-                raise Cancelled("")
-
-    reporter = Recording()
+    reporter.progress = stop
     with pytest.raises(Cancelled):
         apply_edits(splats, objects, reporter)
-    assert reporter.seen == sorted(reporter.seen) and reporter.seen[-1] == 1
 
 
 def test_no_fill_without_surrounding_surface():
