@@ -73,7 +73,7 @@ def add_vote(command: argparse.ArgumentParser, out_required: bool = True) -> Non
         "--seed", type=types.index, default=0, metavar="N", help="random seed; the same seed gives the same result (0)"
     )
     command.add_argument(
-        "--only", nargs="+", metavar="OBJECT",
+        "--only", action="extend", nargs="+", metavar="OBJECT",
         help="reconstruct only these objects, by name or ID; all others count as unlabeled",
     )  # fmt: skip
     command.add_argument(
@@ -145,10 +145,16 @@ def add_splats(command: argparse.ArgumentParser) -> None:
 def add_plan_overrides(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("overriding the plan; `plan` shows its decisions and their reasons")
     group.add_argument(
-        "--keep", nargs="+", default=[], choices=(*KEYS, EVERYTHING), metavar="KEY",
+        "--keep", action="extend", nargs="+", default=[], choices=(*KEYS, EVERYTHING), metavar="KEY",
         help=f"do what the plan omits: {', '.join(KEYS)}, or {EVERYTHING}",
     )  # fmt: skip
     group.add_argument(
-        "--leave-out", nargs="+", default=[], choices=KEYS, metavar="KEY", help="omit what the plan does"
+        "--leave-out",
+        action="extend",
+        nargs="+",
+        default=[],
+        choices=KEYS,
+        metavar="KEY",
+        help="omit what the plan does",
     )
     group.add_argument("--no-meshes", action="store_true", help="plan for splats without meshes")

@@ -110,7 +110,12 @@ def _add_capture_commands(commands: _Commands) -> None:
         "--frames", type=types.count, metavar="N", help="number of frames of each video (by how far the picture moves)"
     )
     poses.add_argument(
-        "--leave-out", nargs="+", default=[], metavar="NAME", help="photos to leave out, named as in images/"
+        "--leave-out",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="photos to leave out, named as in images/",
     )
     poses.add_argument(
         "--list", type=Path, metavar="FILE",
@@ -251,7 +256,11 @@ def _add_mesh(commands: _Commands) -> None:
         "mesh", "Extract a textured mesh of each object", texts.MESH, "garden-splats --objects mug can"
     )
     mesh.add_argument(
-        "--objects", nargs="+", metavar="OBJECT", help="names or IDs (default: every object that is not left out)"
+        "--objects",
+        action="extend",
+        nargs="+",
+        metavar="OBJECT",
+        help="names or IDs (default: every object that is not left out)",
     )
     mesh.add_argument(
         "--set", action="append", type=types.named_set, metavar="NAME=ID,ID",
@@ -290,7 +299,7 @@ def _add_edit(commands: _Commands) -> None:
         "garden-splats --remove mug --recolor can:hue=0.3 --move box:x=0.1",
     )  # fmt: skip
     options.add_reconstruction(edit)
-    edit.add_argument("--remove", nargs="+", default=[], metavar="OBJECT", help="remove objects")
+    edit.add_argument("--remove", action="extend", nargs="+", default=[], metavar="OBJECT", help="remove objects")
     edit.add_argument(
         "--floaters", action="store_true", help="with --remove: also remove unlabeled floaters inside the objects"
     )
@@ -299,29 +308,41 @@ def _add_edit(commands: _Commands) -> None:
         help="with --remove or --move: fill the holes that the objects leave in flat ground or walls from their "
         "surroundings; the fill is marked as unobserved",
     )  # fmt: skip
-    edit.add_argument("--restore", nargs="+", default=[], metavar="OBJECT", help="restore removed objects")
     edit.add_argument(
-        "--clean-floaters", nargs="+", default=[], metavar="OBJECT",
+        "--restore", action="extend", nargs="+", default=[], metavar="OBJECT", help="restore removed objects"
+    )
+    edit.add_argument(
+        "--clean-floaters", action="extend", nargs="+", default=[], metavar="OBJECT",
         help="hide the floaters of objects, or of `all`: splats far from the rest, and small groups apart from it",
     )  # fmt: skip
     edit.add_argument(
-        "--restore-floaters", nargs="+", default=[], metavar="OBJECT", help="show the floaters of objects, or of `all`"
+        "--restore-floaters",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="OBJECT",
+        help="show the floaters of objects, or of `all`",
     )
     edit.add_argument(
-        "--recolor", nargs="+", default=[], type=types.recolor, metavar="OBJECT:KEY=VALUE",
+        "--recolor", action="extend", nargs="+", default=[], type=types.recolor, metavar="OBJECT:KEY=VALUE",
         help="hue (-0.5 to 0.5, in turns of the color wheel), saturation, value and contrast (factors; 1: unchanged), "
         "tint=#RRGGBB, replace=#RRGGBB and amount (0 to 1, how much of replace)",
     )  # fmt: skip
     edit.add_argument(
-        "--move", nargs="+", default=[], type=types.placement, metavar="OBJECT:KEY=VALUE",
+        "--move", action="extend", nargs="+", default=[], type=types.placement, metavar="OBJECT:KEY=VALUE",
         help="move relative to the captured position: x, y, z, rx, ry, rz, scale",
     )  # fmt: skip
     edit.add_argument(
-        "--duplicate", nargs="+", default=[], type=types.placement, metavar="OBJECT:KEY=VALUE",
+        "--duplicate", action="extend", nargs="+", default=[], type=types.placement, metavar="OBJECT:KEY=VALUE",
         help="add a duplicate with this transform, as for --move",
     )  # fmt: skip
     edit.add_argument(
-        "--reset", nargs="+", default=[], metavar="OBJECT", help="undo all of these edits of objects, or of `all`"
+        "--reset",
+        action="extend",
+        nargs="+",
+        default=[],
+        metavar="OBJECT",
+        help="undo all of these edits of objects, or of `all`",
     )
 
 
@@ -334,7 +355,9 @@ def _add_export(commands: _Commands) -> None:
     export.add_argument(
         "--format", choices=("ply", "spz", "splat"), help="file format (default: by the file's suffix, else ply)"
     )
-    export.add_argument("--objects", nargs="+", metavar="OBJECT", help="names or IDs (default: everything)")
+    export.add_argument(
+        "--objects", action="extend", nargs="+", metavar="OBJECT", help="names or IDs (default: everything)"
+    )
     export.add_argument("--per-object", action="store_true", help="write one file per object")
     export.add_argument(
         "--coordinates", choices=("capture", "blender"), default="capture",

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from backend.cli.parser import build_parser
+
 HEAVY = {"torch", "numba", "pycolmap", "scipy", "PIL"}
 
 
@@ -36,3 +38,16 @@ def test_torch_and_pycolmap_may_each_have_an_openmp_on_macos(system, value):
         [sys.executable, "-c", code], cwd=Path(__file__).parents[2], env=environment, capture_output=True, text=True
     )
     assert ran.stdout == f"{value}\n", ran.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["edit", "d", "--remove", "mug", "--remove", "can"], "remove"),
+        (["mesh", "d", "--objects", "mug", "--objects", "can"], "objects"),
+        (["train", "c", "--out", "d", "--only", "mug", "--only", "can"], "only"),
+    ],
+)
+def test_repeated_options_add_to_each_other(words, name):
+    assert vars(build_parser().parse_args(words))[name] == ["mug", "can"]
+    assert vars(build_parser().parse_args(words[:-2]))[name] == ["mug"], "the default is unchanged"
