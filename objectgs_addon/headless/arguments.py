@@ -203,7 +203,12 @@ def _parser() -> argparse.ArgumentParser:
         "Put a reconstruction's cameras, points, splats and meshes into a new .blend file.",
     )
     build.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
-    build.add_argument("--blend", type=Path, metavar="FILE", help="file to write (DIR/objectgs.blend)")
+    build.add_argument(
+        "--blend",
+        type=Path,
+        metavar="FILE",
+        help="file to write (DIR/objectgs.blend, or objectgs-2.blend if that was saved since)",
+    )
     render = command("render", "render an image of a .blend", "Render an image of a .blend file made by build.")
     render.add_argument(
         "source",

@@ -16,7 +16,8 @@ from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.report import MIOU_LABELS, read_report
 from ...backend.shared.version import __version__
-from .commands import BLEND, PICTURE, StepFailed, absolute, find_backend, path_options, reconstruct, sentence
+from .built import BLEND
+from .commands import PICTURE, StepFailed, absolute, find_backend, path_options, reconstruct, sentence
 
 DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished"
 

@@ -24,9 +24,9 @@ from ..process.blocking import run_blocking
 from ..state import folder_trust
 from ..state import viewports as view
 from . import apart
+from .built import BLEND, blend_to_write, remember_built
 from .picture import render_picture
 
-BLEND = "objectgs.blend"
 PICTURE = "render.png"
 APART_PICTURE = "pulled-apart.png"
 SAMPLES = 16
@@ -117,7 +117,8 @@ def import_splats(options: argparse.Namespace) -> None:
 def build(options: argparse.Namespace) -> None:
     """Build a .blend from a reconstruction."""
     folder = absolute(options.folder)
-    build_blend(folder, absolute(options.blend) if options.blend else folder / BLEND, options.reporter)
+    blend = absolute(options.blend) if options.blend else blend_to_write(folder, options.reporter)
+    build_blend(folder, blend, options.reporter)
 
 
 def render(options: argparse.Namespace) -> None:
@@ -162,10 +163,11 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
         except NothingMade as error:  # Splats without a surface, or without held-out views, are still a valid result.
             options.reporter.warning(str(error))
     run_backend(options.reporter, "report", folder, folder)
-    has_meshes = build_blend(folder, folder / BLEND, options.reporter)
+    blend = blend_to_write(folder, options.reporter)
+    has_meshes = build_blend(folder, blend, options.reporter)
     render_picture(
         options.reporter,
-        folder / BLEND,
+        blend,
         folder / PICTURE,
         None,
         options.engine,
@@ -175,7 +177,7 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
     )
     options.reporter.status(f"Wrote {folder / PICTURE}.")
     if has_meshes:
-        _render_apart(folder / BLEND, folder / APART_PICTURE, options)
+        _render_apart(blend, folder / APART_PICTURE, options)
         options.reporter.status(f"Wrote {folder / APART_PICTURE}.")
 
 
@@ -260,6 +262,8 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
         reporter.warning(warning)
     folder_trust.store_relative(root, str(blend))
     save_blend(blend, reporter)
+    if blend.parent == folder:
+        remember_built(blend)
     return has_meshes
 
 

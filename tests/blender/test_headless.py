@@ -23,7 +23,7 @@ from objectgs.objectgs_addon.headless.batch import fingerprint
 
 import headless
 
-from .building import tetrahedron, write_meshes
+from .building import look_at, tetrahedron, write_cameras, write_meshes, write_objects, write_points
 
 SIZE = ("--size", "48x36", "--samples", "1")
 
@@ -114,6 +114,23 @@ def test_build_contains_reconstruction(blend, trained):
     wanted = {entry["name"] for entry in json.loads((trained / "objects.json").read_text())["objects"]}
     assert wanted <= names
     assert bpy.context.scene.camera is not None
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def test_build_keeps_a_file_that_was_saved_since(tmp_path, capsys):
+    write_cameras(tmp_path, [look_at((0, -1, 10.0))])
+    write_points(tmp_path, np.random.default_rng(0).normal(size=(9, 3)), np.ones(9, int))
+    write_objects(tmp_path, {1: "mug"})
+    first, second = tmp_path / "objectgs.blend", tmp_path / "objectgs-2.blend"
+    for _ in range(2):
+        assert headless.main(["build", str(tmp_path)]) == 0
+    assert not second.exists() and "kept" not in capsys.readouterr().err
+    bpy.ops.wm.save_as_mainfile(filepath=str(first))
+    saved = first.read_bytes()
+    for _ in range(2):
+        assert headless.main(["build", str(tmp_path)]) == 0
+        assert "kept; objectgs-2.blend is written instead." in capsys.readouterr().err
+    assert first.read_bytes() == saved and second.exists() and not (tmp_path / "objectgs-3.blend").exists()
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 

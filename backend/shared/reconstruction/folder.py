@@ -41,6 +41,7 @@ class Reconstruction:
         self.report_md = self.folder / "report.md"
         self.pictures = self.folder / "pictures"
         self.cells = self.folder / "cells"
+        self.built = self.folder / "built.json"
 
     def require_foreign(self, path: Path) -> None:
         """Raise InputError if `path` is a file of the reconstruction, or is in one of its folders."""
