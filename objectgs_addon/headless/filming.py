@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import bpy
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.events import Reporter
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.shot import NAME, frame_ranges, write_shot
 from .. import film as filming
 from .. import scene
 from ..environment import known_folders
 from ..film.properties import samples_of
+from ..state import folder_trust
 from . import apart
 from .commands import absolute, find_backend, run_backend, save_blend
 from .picture import choose_camera, choose_engine, open_blend, write_picture
@@ -36,9 +39,7 @@ def film(options: argparse.Namespace) -> None:
     root = found[0]
     if len(found) > 1:
         reporter.warning(f"{blend} has {len(found)} reconstructions; {root.name} is rendered.")
-    folder = absolute(options.dir) if options.dir else scene.folder_of(root)
-    if known_folders.is_remote(folder) and not options.dir:
-        raise InputError(f"{blend} names the folder {folder} on another computer; give it with --dir to use it.")
+    folder = absolute(options.dir) if options.dir else _folder_of(root, blend, reporter)
     if not Reconstruction(folder).splats.is_file():
         raise InputError(f"The reconstruction folder {folder} has no splats.ply; name its present location with --dir.")
     frames = _frames(options, target)
@@ -84,6 +85,20 @@ def film(options: argparse.Namespace) -> None:
             path = out / f"composite.{number:04d}.{options.composite}"
             write_picture(target, path)
             reporter.status(f"Wrote {path}.")
+
+
+def _folder_of(root: bpy.types.Collection, blend: Path, reporter: Reporter) -> Path:
+    """Return the reconstruction folder of a .blend: the one at its place relative to the .blend, else the stored."""
+    stored = scene.folder_of(root)
+    beside = folder_trust.moved_folder(root)
+    if beside is not None:
+        reporter.status(
+            f"Using the folder {beside} instead of {stored}, since it was moved or copied with {blend.name}."
+        )
+        return beside
+    if known_folders.is_remote(stored):
+        raise InputError(f"{blend} names the folder {stored} on another computer; give it with --dir to use it.")
+    return stored
 
 
 def _frames(options: argparse.Namespace, target: bpy.types.Scene) -> list[int]:

@@ -736,6 +736,35 @@ def test_film_command_applies_edits_and_reports_errors(shot_blend, backend_pytho
 
 
 @pytest.fixture
+def noting_backend(tmp_path, monkeypatch):
+    """A stand-in for the backend that does nothing, and the file of its command lines."""
+    calls, python = tmp_path / "calls", tmp_path / "python"
+    python.write_text(f"""#!/bin/sh\necho "$@" >> '{calls}'\necho '{{"type": "done"}}'\n""")
+    python.chmod(0o755)
+    monkeypatch.setenv("OBJECTGS_PYTHON", str(python))
+    yield calls
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def test_film_command_uses_the_folder_that_was_copied_with_the_file(shot_blend, noting_backend, tmp_path, capsys):
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    root = next(c for c in bpy.data.collections if blender_scene.kind_of(c) == "reconstruction")
+    root[kinds.RELATIVE_FOLDER] = "wall"
+    farm = tmp_path / "farm"
+    farm.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(farm / "shot.blend"), copy=True)
+
+    def used():
+        assert headless.main(["film", str(farm / "shot.blend"), "--out", str(tmp_path / "out")]) == 0
+        return noting_backend.read_text().splitlines()[-1].split()[3], capsys.readouterr().out
+
+    assert used()[0] == str(shot_blend.parent / "wall"), "nothing was copied yet"
+    shutil.copytree(shot_blend.parent / "wall", farm / "wall")
+    folder, output = used()
+    assert folder == str(farm / "wall") and f"Using the folder {folder} instead" in output
+
+
+@pytest.fixture
 def registered():
     extension = headless.extension()
     extension.register()
