@@ -238,6 +238,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_TRAIN_OPTIONS,
     )
     _backend(run)
+    _compute(run)
     _groups(run)
     _meshes(run)
     _picture(run)
@@ -250,6 +251,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_TRAIN_OPTIONS,
     )
     _backend(batch)
+    _compute(batch)
     _groups(batch)
     _meshes(batch)
     _picture(batch)
@@ -311,6 +313,13 @@ def _demo(sub: argparse.ArgumentParser) -> None:
 def _backend(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
     sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help="reconstruction folder")
     _backend_python(sub)
+
+
+def _compute(sub: argparse.ArgumentParser) -> None:
+    """Add the options that each of several commands of the backend takes."""
+    sub.add_argument("--device", choices=("auto", "cpu", "cuda"), help="device of all steps (auto)")
+    sub.add_argument("--threads", type=_count, metavar="N", help="number of CPU threads of each step (all)")
+    sub.add_argument("--memory-mb", type=_count, metavar="MB", help="memory of each step for decoded images (2000)")
 
 
 def _groups(sub: argparse.ArgumentParser) -> None:

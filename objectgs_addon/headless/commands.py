@@ -154,15 +154,25 @@ def run(options: argparse.Namespace) -> None:
 def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> None:
     """Create splats, meshes, a report, a .blend and images of `capture` in `folder`; continue an earlier run."""
     no_meshes = ["--no-meshes"] if options.no_meshes else []
+    compute = _compute_options(options)
     run_backend(
-        options.reporter, "train", folder, capture, "--out", folder, *no_meshes, *path_options(options), *options.rest
+        options.reporter,
+        "train",
+        folder,
+        capture,
+        "--out",
+        folder,
+        *no_meshes,
+        *path_options(options),
+        *compute,
+        *options.rest,
     )
     for command in ["evaluate"] if options.no_meshes else ["mesh", "evaluate"]:
         try:
-            run_backend(options.reporter, command, folder, folder)
+            run_backend(options.reporter, command, folder, folder, *compute)
         except NothingMade as error:  # Splats without a surface, or without held-out views, are still a valid result.
             options.reporter.warning(str(error))
-    run_backend(options.reporter, "report", folder, folder)
+    run_backend(options.reporter, "report", folder, folder, *compute)
     blend = blend_to_write(folder, options.reporter)
     has_meshes = build_blend(folder, blend, options.reporter)
     render_picture(
@@ -185,6 +195,11 @@ def path_options(options: argparse.Namespace) -> list[str]:
     """Return those of the backend's options --capture and --groups that were given, with absolute paths."""
     given = {name: vars(options).get(name) for name in ("capture", "groups")}
     return [word for name, path in given.items() if path for word in (f"--{name}", str(absolute(path)))]
+
+
+def _compute_options(options: argparse.Namespace) -> list[str]:
+    given = {"--device": options.device, "--threads": options.threads, "--memory-mb": options.memory_mb}
+    return [word for name, value in given.items() if value is not None for word in (name, str(value))]
 
 
 def _render_apart(blend: Path, out: Path, options: argparse.Namespace) -> None:

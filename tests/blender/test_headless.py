@@ -17,6 +17,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from objectgs.backend.cli.parser import build_parser
 from objectgs.backend.shared.formats.ply import read_vertices
 from objectgs.objectgs_addon.headless import COMMANDS
 from objectgs.objectgs_addon.headless.batch import fingerprint
@@ -314,6 +315,19 @@ def test_run_succeeds_without_meshes(capture, trained, backend_python, tmp_path)
     assert "warning: No mesh can be made." in ran.errors
     assert (folder / "render.png").is_file() and not (folder / "pulled-apart.png").exists()
     assert "No mesh can be made" in error_report("mesh", folder, "--backend-python", python)
+
+
+def test_run_passes_the_device_to_every_step(capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    calls, python = tmp_path / "calls", tmp_path / "python"
+    python.write_text(f"""#!/bin/sh\nshift 2; echo "$@" >> '{calls}'; echo '{{"type": "done"}}'\n""")
+    python.chmod(0o755)
+    words = ["--device", "cpu", "--threads", "1", "--memory-mb", "700", "--backend-python", str(python)]
+    assert headless.main(["run", str(capture), "--out", str(tmp_path / "out"), "--max-size", "99", *words]) == 2
+    found = [build_parser().parse_args(line.split()) for line in calls.read_text().splitlines()]
+    assert [options.command for options in found] == ["train", "mesh", "evaluate", "report"]
+    assert {(options.device, options.threads, options.memory_mb) for options in found} == {("cpu", 1, 700)}
+    assert found[0].max_size == 99
 
 
 def test_meshes_that_fail_for_another_reason_end_a_run(capture, tmp_path, monkeypatch, capsys):
