@@ -27,7 +27,7 @@ def film(options: argparse.Namespace) -> None:
     reporter = options.reporter
     find_backend(options.backend_python)
     blend, out = absolute(options.blend), absolute(options.out)
-    target = open_blend(blend)
+    target = open_blend(blend, reporter)
     if options.size is not None:
         target.render.resolution_x, target.render.resolution_y = options.size
         target.render.resolution_percentage = 100

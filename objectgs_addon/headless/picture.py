@@ -48,7 +48,7 @@ def render_picture(
     """
     if out.suffix.lower() not in FORMATS:
         raise InputError(f"{out.name} has no known image format; name it .png, .jpg or .exr.")
-    scene = open_blend(blend)
+    scene = open_blend(blend, reporter)
     if size is not None:
         scene.render.resolution_x, scene.render.resolution_y = size
         scene.render.resolution_percentage = 100
@@ -77,13 +77,23 @@ def write_picture(scene: bpy.types.Scene, out: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def open_blend(blend: Path) -> bpy.types.Scene:
-    """Open a .blend without running its scripts and return its scene; raise InputError if it cannot be opened."""
+def open_blend(blend: Path, reporter: Reporter) -> bpy.types.Scene:
+    """Open a .blend and return its scene; raise InputError if it cannot be opened.
+
+    Its scripts and Python drivers run only with Blender's option -y; without it, a warning tells that there are some.
+    """
+    words = sys.argv[: sys.argv.index("--")] if "--" in sys.argv else []
+    may_run = not {"-y", "--enable-autoexec"}.isdisjoint(words)
     try:
         with quiet():
-            bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=False)
+            bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=may_run)
     except RuntimeError as error:
         raise InputError(f"{blend} cannot be opened as a .blend file.") from error
+    if bpy.app.autoexec_fail:
+        reporter.warning(
+            f"Python in {blend} is not run ({bpy.app.autoexec_fail_message}), and what depends on it may look wrong; "
+            "if you trust the file, give Blender the option -y before -P."
+        )
     return bpy.context.scene
 
 

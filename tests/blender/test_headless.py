@@ -18,9 +18,11 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.cli.parser import build_parser
+from objectgs.backend.shared.console import ConsoleReporter
 from objectgs.backend.shared.formats.ply import read_vertices
 from objectgs.objectgs_addon.headless import COMMANDS
 from objectgs.objectgs_addon.headless.batch import fingerprint
+from objectgs.objectgs_addon.headless.picture import open_blend
 
 import headless
 
@@ -147,6 +149,20 @@ def test_build_and_render_reject_invalid_input(trained, blend, tmp_path):
     (tmp_path / "file").write_text("")
     assert str(tmp_path / "file") in error_report("build", trained, "--blend", tmp_path / "file" / "a.blend")
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["broken.blend", "file"]
+
+
+@pytest.mark.parametrize("options", [[], ["-y"]])
+def test_python_drivers_run_only_if_allowed(tmp_path, monkeypatch, capsys, options):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    bpy.context.scene.collection.objects.link(camera)
+    camera.driver_add("location", 0).driver.expression = "bpy.data.version[0]"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "driven.blend"))
+    monkeypatch.setattr(sys, "argv", ["blender", "-b", *options, "-P", "headless.py", "--", "render"])
+    assert open_blend(tmp_path / "driven.blend", ConsoleReporter()) == bpy.context.scene
+    assert bpy.data.objects["Camera"].location[0] == (bpy.app.version[0] if options else 0.0)
+    assert ("the option -y" in capsys.readouterr().err) is not bool(options)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
 @pytest.mark.long
