@@ -30,6 +30,14 @@ const START_IF_HELD_OUT = "import json, os, sys; "
     + "cameras = json.load(open(os.path.join(sys.argv[-1], 'cameras.json'), encoding='utf-8'))['cameras']; "
     + "any(camera['held_out'] for camera in cameras) or sys.exit(); " + START;
 
+// Goes on after `mesh` if it has tried every object: without a surface, none has a mesh, but the splats are measured.
+const START_MESH = "import json, os, sys\n"
+    + "try:\n    " + START + "\n"
+    + "except SystemExit as end:\n"
+    + "    path = os.path.join(sys.argv[-1], 'meshes', 'meshes.json')\n"
+    + "    if end.code != 2 or not os.path.exists(path) or 'waiting' in json.load(open(path, encoding='utf-8')):\n"
+    + "        raise";
+
 function compileJob(job) {
     const settings = job.settings;
     const names = settings.names.split(/[,\n]/).map((name) => name.trim()).filter((name) => name);
@@ -43,7 +51,7 @@ function compileJob(job) {
             args: ["-c", start, settings.objectgs].concat(args),
         }));
         add(START, ["train", `${settings.captures}/${name}`, "--out", out, "--minutes", String(settings.minutes)]);
-        add(START, ["mesh", out]);
+        add(START_MESH, ["mesh", out]);
         add(START_IF_HELD_OUT, ["evaluate", out]);
         add(START, ["report", out]);
         job.addTask(task);

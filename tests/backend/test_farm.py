@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from backend.cli.parser import build_parser
+from backend.shared.formats.json_file import write_json
 from backend.shared.reconstruction.cameras import Cameras, CameraView, write_cameras
 
 FARM = Path(__file__).resolve().parents[2] / "examples" / "farm"
@@ -70,6 +71,25 @@ def write_views(folder, *, held_out):
     write_cameras(folder, Cameras(folder, np.zeros(3), np.eye(4), views))
 
 
+MESH_ENDS = [
+    ({"meshes": {"1": {"why": "No surface."}}}, "0", 0),
+    ({"meshes": {"1": {"why": "No surface."}}}, "2", 0),
+    ({"meshes": {"1": {"why": "No surface."}}}, "1", 1),
+    ({"meshes": {}, "waiting": ["1"]}, "2", 2),
+    (None, "2", 2),
+]
+"""Content of meshes.json, exit code of `mesh`, and exit code with which a job ends before the evaluation."""
+
+
+def write_meshes_json(folder, content):
+    """Write meshes.json as `mesh` does, or delete it."""
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    path = folder / "meshes" / "meshes.json"
+    path.unlink(missing_ok=True)
+    if content is not None:
+        write_json(path, content)
+
+
 def write_captures(folder):
     """Write two captures, of which the second holds out a view, and another folder; return `folder`."""
     write_views(folder / "a $b", held_out=False)
@@ -115,7 +135,7 @@ def test_flamenco_measures_each_capture_in_a_task(tmp_path):
     assert all(command["name"] == "exec" for task in tasks for command in task["commands"])
     lines = [[command["parameters"]["args"] for command in task["commands"]] for task in tasks]
     assert all(commands_of([words[3:] for words in line]) == EACH_CAPTURE for line in lines)
-    train, _, evaluate, _ = lines[1]
+    train, mesh, evaluate, _ = lines[1]
     options = parsed(train)
     assert (options.capture, options.minutes) == (Path("/my captures/bob's mug"), 7.5)
     assert options.out == tmp_path / "out" / "bob's mug" != parsed(lines[0][0]).out
@@ -130,6 +150,12 @@ def test_flamenco_measures_each_capture_in_a_task(tmp_path):
         write_views(options.out, held_out=held_out)
         run = subprocess.run([sys.executable, *evaluate], check=True, capture_output=True, text=True)
         assert run.stdout == shown
+    (tmp_path / "backend" / "__main__.py").write_text("import os, sys\nsys.exit(int(os.environ['CODE']))\n")
+    for meshes, code, expected in MESH_ENDS:
+        write_meshes_json(options.out, meshes)
+        environment = {**os.environ, "CODE": code}
+        ran = subprocess.run([sys.executable, *mesh], check=False, env=environment, capture_output=True)
+        assert ran.returncode == expected
 
 
 def test_code_that_starts_the_backend_runs_it_from_any_folder(tmp_path):
@@ -195,13 +221,13 @@ def test_openjd_template_measures_each_capture_in_a_task(tmp_path):
         "    print(json.dumps(words), flush=True)\n"
         "    if words[0] == 'train':\n"
         "        shutil.copytree(words[1], words[3], dirs_exist_ok=True)\n"
-        "    return 3 if words[0] == os.environ.get('FAILS') else 0\n"
+        "    return int(os.environ['CODE']) if words[0] == os.environ.get('FAILS') else 0\n"
     )
     captures = write_captures(tmp_path / "my captures")
     values |= {"Captures": str(captures), "Out": str(tmp_path / "out"), "ObjectGS": str(tmp_path), "Count": "2"}
     values |= {"Minutes": "7.5"}
 
-    def run(number, count="2", fails=""):
+    def run(number, count="2", fails="", code="3"):
         own = {
             **{f"Param.{name}": value for name, value in {**values, "Count": count}.items()},
             "Task.Param.Capture": number, f"Task.File.{script['name']}": str(tmp_path / script["filename"]),
@@ -209,8 +235,9 @@ def test_openjd_template_measures_each_capture_in_a_task(tmp_path):
         words = step["script"]["actions"]["onRun"]["args"]
         filled = [re.sub(r"{{([\w.]+)}}", lambda match: own[match[1]], word) for word in words]
         done = subprocess.run(
-            [sys.executable, *filled], check=False, capture_output=True, text=True, env={**os.environ, "FAILS": fails}
-        )
+            [sys.executable, *filled], check=False, capture_output=True, text=True,
+            env={**os.environ, "FAILS": fails, "CODE": code},
+        )  # fmt: skip
         return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
     for number, name, expected in (("1", "a $b", ["train", "mesh", "report"]), ("2", "b's", EACH_CAPTURE)):
@@ -221,6 +248,10 @@ def test_openjd_template_measures_each_capture_in_a_task(tmp_path):
         assert {o.capture for o in options} == {captures / name}, "each worker may have another path of it"
     code, lines, _ = run("2", fails="mesh")
     assert code == 3 and commands_of(lines) == ["train", "mesh"]
+    for meshes, code, expected in MESH_ENDS:
+        write_meshes_json(tmp_path / "out" / "b's", meshes)
+        ended, lines, _ = run("2", fails="mesh", code=code)
+        assert ended == expected and commands_of(lines) == (EACH_CAPTURE[:2] if expected else EACH_CAPTURE)
     code, lines, error = run("1", count="3")
     assert code and not lines and "2 captures instead of 3" in error, "a wrong number would leave captures out"
 
@@ -265,7 +296,8 @@ def test_slurm_script_submits_captures_as_an_array(tmp_path):
     # Trains by copying the cameras.json of the capture.
     python.write_text(
         f'#!/bin/bash\n(printf "%s\\t" "$@"; echo) >> {tmp_path}/run\n'
-        'if [ "$3" = train ]; then mkdir -p "$6" && cp "$4/cameras.json" "$6"; fi\n[ "$3" != "${FAILS:-}" ]\n'
+        'if [ "$3" = train ]; then mkdir -p "$6" && cp "$4/cameras.json" "$6"; fi\n'
+        'if [ "$3" = "${FAILS:-}" ]; then exit "$CODE"; fi\n'
     )
     stub.chmod(0o755)
     python.chmod(0o755)
@@ -278,11 +310,10 @@ def test_slurm_script_submits_captures_as_an_array(tmp_path):
     assert {"--partition=gpu", "--array=0-1", f"--chdir={Path.cwd()}"} <= set(options)
     del environment["PYTHON"]
 
-    def run(number, fails=""):
+    def run(number, fails="", code="3"):
         (tmp_path / "run").unlink(missing_ok=True)
-        code = subprocess.run(
-            element, check=False, env={**environment, "SLURM_ARRAY_TASK_ID": number, "FAILS": fails}
-        ).returncode
+        own = {"SLURM_ARRAY_TASK_ID": number, "FAILS": fails, "CODE": code}
+        code = subprocess.run(element, check=False, env={**environment, **own}).returncode
         lines = [line.split("\t")[:-1] for line in (tmp_path / "run").read_text().splitlines()]
         assert all(words[:2] == ["-m", "backend"] for words in lines)
         return code, [words[2:] for words in lines]
@@ -293,7 +324,11 @@ def test_slurm_script_submits_captures_as_an_array(tmp_path):
         options = build_parser().parse_args(lines[0])
         assert (options.capture, options.out, options.minutes) == (captures / name, out / name, 7.5)
     code, lines = run("1", fails="mesh")
-    assert code and commands_of(lines) == ["train", "mesh"]
+    assert code == 3 and commands_of(lines) == ["train", "mesh"]
+    for meshes, code, expected in MESH_ENDS:
+        write_meshes_json(out / "b's", meshes)
+        ended, lines = run("1", fails="mesh", code=code)
+        assert ended == expected and commands_of(lines) == (EACH_CAPTURE[:2] if expected else EACH_CAPTURE)
     nothing = subprocess.run(
         [script, str(out), "/o", "1"], check=False, capture_output=True, env=environment, text=True
     )
