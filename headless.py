@@ -11,10 +11,13 @@
 import importlib
 import importlib.util
 import sys
+import traceback
 from pathlib import Path
 from types import ModuleType
 
 ROOT = Path(__file__).resolve().parent
+OLDEST = (4, 2)
+"""The oldest version of Blender that has all that ObjectGS needs, as in blender_manifest.toml."""
 
 
 def extension() -> ModuleType:
@@ -47,5 +50,22 @@ def _arguments() -> list[str]:
     return sys.argv[1:] if Path(sys.argv[0]).name == Path(__file__).name else []
 
 
+def _run() -> int:
+    """Run the command line of this process and return the exit code.
+
+    Nothing is raised, since Blender would print the exception and end with exit code 0.
+    """
+    try:
+        version = importlib.import_module("bpy").app.version
+        if version[:2] < OLDEST:
+            needed, own = (".".join(map(str, each)) for each in (OLDEST, version))
+            print(f"error: ObjectGS needs Blender {needed} or newer; this is Blender {own}.", file=sys.stderr)
+            return 2
+        return main(_arguments())
+    except Exception:
+        traceback.print_exc()
+        return 1
+
+
 if __name__ == "__main__":
-    sys.exit(main(_arguments()))
+    sys.exit(_run())

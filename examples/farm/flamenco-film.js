@@ -27,7 +27,7 @@ function compileJob(job) {
         task.addCommand(author.Command("exec", {
             exe: "{blender}",
             args: [
-                "-b", "-P", settings.headless, "--", "film", settings.blend, "--out", settings.out,
+                "-b", "--python-exit-code", "1", "-P", settings.headless, "--", "film", settings.blend, "--out", settings.out,
                 "--frames", chunk, "--backend-python", settings.python, ...folder,
             ],
         }));

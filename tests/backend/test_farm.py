@@ -16,6 +16,8 @@ from backend.shared.formats.json_file import write_json
 from backend.shared.reconstruction.cameras import Cameras, CameraView, write_cameras
 
 FARM = Path(__file__).resolve().parents[2] / "examples" / "farm"
+EXIT_CODE = ["--python-exit-code", "1"]
+"""Without it, Blender ends with exit code 0 if it does not find headless.py."""
 EACH_CAPTURE = ["train", "mesh", "evaluate", "report"]
 
 COMPILE = """
@@ -122,7 +124,9 @@ def test_flamenco_renders_a_film_by_ranges():
     tasks = compiled("flamenco-film.js", blend="/s.blend", out="/f", frames="1-24,50-80", objectgs="/x")
     arguments = [task["commands"][0]["parameters"]["args"] for task in tasks]
     assert [words[words.index("--frames") + 1] for words in arguments] == ["1-24", "50-80"]
-    assert all(words[:2] == ["-b", "-P"] and words[4] == "film" and "--dir" not in words for words in arguments)
+    assert all(
+        words[:4] == ["-b", *EXIT_CODE, "-P"] and words[6] == "film" and "--dir" not in words for words in arguments
+    )
     moved = compiled("flamenco-film.js", blend="/s.blend", out="/f", frames="1", objectgs="/x", dir="/a b")
     assert moved[0]["commands"][0]["parameters"]["args"][-2:] == ["--dir", "/a b"]
 

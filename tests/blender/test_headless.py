@@ -10,7 +10,9 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -107,6 +109,22 @@ def test_invalid_arguments_are_rejected(arguments, words, capsys):
     assert headless.main(list(arguments)) == 2
     captured = capsys.readouterr()
     assert words in captured.err and captured.err.count("\n") == 1 and not captured.out
+
+
+@pytest.mark.parametrize(
+    ("version", "code", "words"),
+    [((4, 1, 1), 2, "needs Blender 4.2 or newer; this is Blender 4.1.1."), ((4, 2, 0), 1, "ImportError: no StrEnum")],
+)
+def test_failures_to_start_have_exit_codes(monkeypatch, capsys, version, code, words):
+    def fail(_arguments):
+        raise ImportError("no StrEnum")
+
+    monkeypatch.setattr(headless, "main", fail)
+    monkeypatch.setitem(sys.modules, "bpy", SimpleNamespace(app=SimpleNamespace(version=version)))
+    assert headless._run() == code
+    assert words in capsys.readouterr().err
+    manifest = tomllib.loads((headless.ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))
+    assert manifest["blender_version_min"].startswith(".".join(map(str, headless.OLDEST)))
 
 
 def test_build_contains_reconstruction(blend, trained):
