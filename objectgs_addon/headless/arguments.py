@@ -27,8 +27,9 @@ _BATCH = """\
 Run every capture in FOLDER (each subfolder with images/ or sparse/), each into
 DIR/<name>, and write a summary to DIR/batch.md and DIR/batch.json. A failure does
 not stop the other captures. The same command continues later; captures that were
-finished with the same settings are skipped. Exit code 2 if any capture cannot be
-used, 1 if any failed for another reason.
+finished with the same settings are skipped, and so are those that another process
+runs, so several computers can share the folders. Exit code 2 if any capture cannot
+be used, 1 if any failed for another reason.
 """
 
 _TRAIN_OPTIONS = """\

@@ -6,14 +6,17 @@ from __future__ import annotations
 import argparse
 import time
 import traceback
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
+from ...backend.shared.formats.file_names import legible
 from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.lock import FolderInUse, locked
 from ...backend.shared.reconstruction.report import MIOU_LABELS, read_report
 from ...backend.shared.version import __version__
 from .built import BLEND
@@ -23,6 +26,9 @@ DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished
 
 _CAPTURE_FILES = {".json", ".txt", ".out", ".xml", ".csv", ".ply", ".obj"}
 """Suffixes of files beside images/ that a capture may consist of: labels, held-out views, cameras and points."""
+
+_LOCK, _PATIENCE = ".batch.lock", 10.0
+"""File name of the lock of the summary, and seconds to wait for another process that writes it."""
 
 _NOTHING: dict[str, Any] = {
     "state": UNFINISHED, "psnr": None, "miou": None, "miou_all": None, "zero_is_background": None, "splats": None,
@@ -51,13 +57,14 @@ def batch(options: argparse.Namespace) -> None:
     Reconstruction(out).create()
     summary = _Summary(out, captures)
     for number, capture in enumerate(captures, 1):
-        entry = summary.entry(capture.name)
-        title = f"{capture.name} ({number} of {len(captures)})"
+        entry = summary.entry(legible(capture.name))
+        title = f"{entry['name']} ({number} of {len(captures)})"
         try:
-            wanted = {**settings, "capture": str(capture), "files": fingerprint(capture)}
-        except OSError as error:
-            entry.update(_NOTHING, settings=None, state=BAD_INPUT, error=sentence(error))
-            summary.write()
+            wanted = {**settings, "capture": _text(capture), "files": fingerprint(capture)}
+        except (InputError, OSError) as error:
+            reason = sentence(error) if isinstance(error, OSError) else str(error)
+            entry.update(_NOTHING, settings=None, state=BAD_INPUT, error=reason)
+            summary.update(entry)
             options.reporter.status(f"== {title}: {entry['error']}")
             continue
         if _is_done(entry, wanted, out / capture.name):
@@ -65,6 +72,7 @@ def batch(options: argparse.Namespace) -> None:
             continue
         options.reporter.status(f"== {title}")
         _run_one(capture, out / capture.name, entry, wanted, summary, options)
+    summary.read()
     options.reporter.status(f"{summary.sentence()} See {out / 'batch.md'}.")
     if summary.count(BAD_INPUT):
         raise InputError(f"{summary.count(BAD_INPUT)} of {len(captures)} captures cannot be used.")
@@ -83,6 +91,13 @@ def _captures(source: Path) -> list[Path]:
     if not found:
         raise InputError(f"The folder {source} contains no captures: no subfolder has images/ or sparse/.")
     return found
+
+
+def _text(path: Path) -> str:
+    """Return a path as text; raise InputError if it is not Unicode, which no file of a reconstruction can hold."""
+    if legible(str(path)) != str(path):
+        raise InputError(f"{legible(str(path))} is a name that is not text in UTF-8; rename it.")
+    return str(path)
 
 
 def fingerprint(capture: Path) -> list[int]:
@@ -109,8 +124,8 @@ def _run_one(
     """Run one capture; its entry in the summary stays valid even if the process is killed."""
     earlier = entry["seconds"] if entry["state"] == UNFINISHED and entry["settings"] == wanted else 0.0
     entry.update(_NOTHING, settings=wanted, seconds=earlier)
-    summary.write()
-    started = time.monotonic()
+    summary.update(entry)
+    started, is_elsewhere = time.monotonic(), False
     try:
         reconstruct(capture, folder, options)
         report = read_report(folder)
@@ -125,6 +140,10 @@ def _run_one(
     except (Cancelled, KeyboardInterrupt):
         entry["error"] = "Cancelled; the same command continues from there."
         raise
+    except FolderInUse as error:
+        # The other process writes the entry, and may have done so by now.
+        is_elsewhere = True
+        options.reporter.warning(f"{capture.name} is left to another process: {error}")
     except InputError as error:
         entry.update(state=BAD_INPUT, error=str(error))
     except OSError as error:
@@ -136,16 +155,39 @@ def _run_one(
         entry.update(state=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
     finally:
         entry["seconds"] = round(earlier + time.monotonic() - started, 1)
-        summary.write()
+        if not is_elsewhere:
+            summary.update(entry)
     if entry["error"]:
         options.reporter.status(f"{capture.name}: {entry['error']}")
 
 
 class _Summary:
-    """Summary in batch.json and batch.md in `folder`, with one entry per capture."""
+    """Summary in batch.json and batch.md in `folder`, with one entry per capture.
+
+    The files are read again before each change, since another computer may run other captures of the same folder.
+    """
 
     def __init__(self, folder: Path, captures: list[Path]) -> None:
         self.json, self.table = folder / "batch.json", folder / "batch.md"
+        self.names = [legible(capture.name) for capture in captures]
+        self.entries: list[dict[str, Any]] = []
+        with self._alone():
+            self.read()
+            self._write()
+
+    def entry(self, name: str) -> dict[str, Any]:
+        self.read()
+        return next(entry for entry in self.entries if entry["name"] == name)
+
+    def update(self, entry: dict[str, Any]) -> None:
+        """Write the entry of a capture."""
+        with self._alone():
+            self.read()
+            self.entries = [entry if other["name"] == entry["name"] else other for other in self.entries]
+            self._write()
+
+    def read(self) -> None:
+        """Read the entries of all captures."""
         known: dict[str, dict[str, Any]] = {}
         if self.json.exists():
             content = read_json(self.json)
@@ -154,11 +196,10 @@ class _Summary:
             except (KeyError, TypeError, ValueError) as error:
                 raise InputError(f"{self.json} was not written by this program; choose another --out.") from error
         fresh = {**_NOTHING, "seconds": 0.0, "settings": None}
-        self.entries = [{"name": capture.name, **fresh, **known.get(capture.name, {})} for capture in captures]
-        self.write()
+        self.entries = [{"name": name, **fresh, **known.get(name, {})} for name in self.names]
 
-    def entry(self, name: str) -> dict[str, Any]:
-        return next(entry for entry in self.entries if entry["name"] == name)
+    def _alone(self) -> AbstractContextManager[None]:
+        return locked(self.json.parent, _LOCK, _PATIENCE)
 
     def count(self, state: str) -> int:
         return sum(entry["state"] == state for entry in self.entries)
@@ -167,7 +208,7 @@ class _Summary:
         parts = [f"{self.count(state)} {state}" for state in (DONE, BAD_INPUT, FAILED, UNFINISHED) if self.count(state)]
         return f"{len(self.entries)} captures: {', '.join(parts)}."
 
-    def write(self) -> None:
+    def _write(self) -> None:
         write_json(self.json, {"captures": self.entries})
         heads = ("capture", "state", "seconds", "PSNR", *MIOU_LABELS.values(), "splats", "error")
         lines = ["| " + " | ".join(heads) + " |", "|---|---|---:|---:|---:|---:|---:|---|"]

@@ -14,7 +14,9 @@ import bpy
 
 from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError, NothingMade
 from ...backend.shared.events import Reporter
+from ...backend.shared.formats.file_names import legible
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.lock import FolderInUse
 from ...backend.shared.stopping import StopRequest
 from .. import scene
 from ..blender.quiet import quiet
@@ -39,7 +41,8 @@ class StepFailed(Exception):
 
 def sentence(error: OSError) -> str:
     """Describe a file error in one sentence."""
-    return f"{error.filename} cannot be used ({error.strerror}); check it, its permissions and the free space."
+    name = legible(str(error.filename))
+    return f"{name} cannot be used ({error.strerror}); check it, its permissions and the free space."
 
 
 def absolute(path: Path) -> Path:
@@ -304,6 +307,7 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
 
     Raises:
         NothingMade: the backend could make nothing of valid input.
+        FolderInUse: another process uses the folder.
         InputError: the backend refused the input.
         Cancelled: the user cancelled.
         StepFailed: the command failed for another reason.
@@ -315,7 +319,7 @@ def run_backend(reporter: Reporter, command: str, folder: Path | None, *argument
     if code == EXIT_CANCELLED:
         raise Cancelled
     if code == EXIT_BAD_INPUT:
-        raise (NothingMade if job.nothing_made else InputError)(job.error)
+        raise (NothingMade if job.nothing_made else FolderInUse if job.in_use else InputError)(job.error)
     raise StepFailed(job.error)
 
 

@@ -68,10 +68,10 @@ class Job:
     The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left (reported
     or estimated, without its jumps), stage (such as "Preparing (1 of 3)", or empty), message (the current step),
     statuses (all messages so far), warnings and error (sentences), lacks (a missing package and the option that needs
-    it), nothing_made (the input was valid, but the command could make nothing of it), training figures (step, splats,
-    anchors, psnr, miou, miou_all, zero_is_background), preview (path of the newest image), curve (quality events:
-    seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done` event), exit_code and log (most recent
-    lines that are not events). number identifies the job in this process.
+    it), nothing_made (the input was valid, but the command could make nothing of it), in_use (another process uses the
+    folder), training figures (step, splats, anchors, psnr, miou, miou_all, zero_is_background), preview (path of the
+    newest image), curve (quality events: seconds, step, psnr, miou, miou_all, mbiou), result (fields of the `done`
+    event), exit_code and log (most recent lines that are not events). number identifies the job in this process.
     """
 
     title: str
@@ -92,6 +92,7 @@ class Job:
     error: str | None = None
     lacks: tuple[str, str] | None = None
     nothing_made: bool = False
+    in_use: bool = False
     step: int | None = None
     splats: int | None = None
     anchors: int | None = None
@@ -263,6 +264,7 @@ class Job:
         elif kind == "error":
             self.error = message
             self.nothing_made = event.get("nothing_made") is True
+            self.in_use = event.get("in_use") is True
             if "lacks" in event:
                 self.lacks = str(event["lacks"]), str(event.get("option", ""))
         elif kind == "done":

@@ -794,6 +794,15 @@ def test_process_stops_on_signal_and_closed_stdout(write_capture, tmp_path):
 # --- locking ---------------------------------------------------------------------------------------------------------
 
 
+def test_folder_in_use_is_named_by_a_field(write_capture, tmp_path, run_command):
+    """The command `batch` of headless.py relies on it."""
+    capture, out = write_capture(views=3, size=(64, 48)).folder, tmp_path / "out"
+    out.mkdir()
+    with lock.locked(out):
+        event = run_command("import", capture, "--out", out, "--json").events[-1]
+    assert event["type"] == "error" and event["in_use"] is True
+
+
 @pytest.mark.long
 def test_folder_is_locked_by_training_process(write_capture, tmp_path, run_command):
     capture, out = write_capture(views=9, size=(64, 48)).folder, tmp_path / "out"

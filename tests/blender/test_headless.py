@@ -576,6 +576,56 @@ def test_batch_goes_on_after_unreadable_folders(capture, tmp_path, monkeypatch, 
     assert summary(out)["b"]["error"] == "Reached."
 
 
+def answering(place, *, when="true", field=""):
+    """Return a stand-in for the backend that refuses every input, after the shell command `when`."""
+    python = place / "python"
+    event = json.dumps({"type": "error", "message": "Reached."})[:-1] + field + "}"
+    python.write_text(f"""#!/bin/sh\n{when}\necho '{event}'\nexit 2\n""")
+    python.chmod(0o755)
+    return str(python)
+
+
+def test_batch_goes_on_after_a_name_that_is_no_text(capture, tmp_path, monkeypatch, capsys):
+    captures, out = tmp_path / "captures", tmp_path / "out"
+    shutil.copytree(capture, captures / "good")
+    try:
+        shutil.copytree(capture, captures / os.fsdecode(b"caf\xe9"))
+    except OSError:
+        pytest.skip("this file system has no such names")
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    words = ["batch", str(captures), "--out", str(out), "--backend-python", answering(tmp_path)]
+    assert headless.main(words) == 2
+    assert "2 of 2 captures cannot be used" in capsys.readouterr().err
+    assert "caf? is a name that is not text in UTF-8; rename it." in summary(out)["caf?"]["error"]
+    assert summary(out)["good"]["error"] == "Reached."
+
+
+def test_batches_of_two_computers_leave_captures_to_each_other(capture, tmp_path, monkeypatch, capsys):
+    """The other one finishes "b" while this one runs "a", and runs "c"."""
+    captures, out = tmp_path / "captures", tmp_path / "out"
+    for name in ("a", "b", "c"):
+        shutil.copytree(capture, captures / name)
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    other = tmp_path / "other.json"
+    swap = f"[ ! -e '{other}' ] || mv '{other}' '{out / 'batch.json'}'"
+    words = ["batch", str(captures), "--out", str(out), "--backend-python"]
+    assert headless.main([*words, answering(tmp_path)]) == 2
+    entries = summary(out)
+    for name in ("render.png", "objectgs.blend"):
+        (out / "b").mkdir(exist_ok=True)
+        (out / "b" / name).touch()
+    entries["a"] |= {"state": "unfinished", "error": None}
+    entries["b"] |= {"state": "done", "error": None, "psnr": 30.0}
+    other.write_text(json.dumps({"captures": list(entries.values())}))
+    capsys.readouterr()
+
+    assert headless.main([*words, answering(tmp_path, when=swap, field=', "in_use": true')]) == 0
+    captured = capsys.readouterr()
+    assert "b (2 of 3): already done." in captured.out and "1 done, 2 unfinished." in captured.out
+    assert "c is left to another process: Reached." in captured.err
+    assert summary(out)["b"] == entries["b"] and summary(out)["c"]["error"] is None
+
+
 @pytest.mark.parametrize(
     ("command", "option"), [("mesh", "--capture"), ("batch", "--groups"), ("import-splats", "--capture")]
 )

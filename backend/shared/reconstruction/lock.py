@@ -34,6 +34,8 @@ _LOCKED_BYTE = 1 << 30
 class FolderInUse(InputError):
     """The folder is locked by another process."""
 
+    fields = {"in_use": True}
+
 
 @contextmanager
 def locked(folder: Path, name: str = NAME, patience: float = _PATIENCE) -> Iterator[None]:
