@@ -81,8 +81,8 @@ _FILM = """\
 Render the splats of a reconstruction through the camera of a .blend, frame by frame:
 color, depth and object mattes in FOLDER/splats.0001.exr and so on, with the edits of
 objects.json and the objects' transforms in the .blend. --composite also renders the
-.blend with Blender and combines both by depth. Existing film frames are skipped, so
-that several machines can share FOLDER, each with its own --frames.
+.blend with Blender and combines both by depth. Existing film frames and composites are
+skipped, so that several machines can share FOLDER, each with its own --frames.
 """
 
 

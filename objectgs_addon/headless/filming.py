@@ -4,22 +4,30 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from pathlib import Path
+from typing import Any
 
 import bpy
 
 from ...backend.shared.errors import InputError
 from ...backend.shared.events import Reporter
+from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.shot import NAME, frame_ranges, write_shot
 from .. import film as filming
 from .. import scene
 from ..environment import known_folders
+from ..film.compositing import PATTERN
 from ..film.properties import samples_of
 from ..state import folder_trust
 from . import apart
+from .built import digest_of
 from .commands import absolute, find_backend, run_backend, save_blend
 from .picture import choose_camera, choose_engine, open_blend, write_picture
+
+COMPOSITES = "composite.json"
+"""File beside the composites with what they were made of, apart from the splats."""
 
 
 def film(options: argparse.Namespace) -> None:
@@ -78,13 +86,50 @@ def film(options: argparse.Namespace) -> None:
         save_blend(absolute(options.save), reporter)
     if options.composite:
         choose_engine(target, options.engine, options.samples, reporter)
-        for number in frames:
+        since = _settled(out, {"blend": digest_of(blend), **_choices(options)})
+        missing = [number for number in frames if not _is_composed(out, number, options.composite, since)]
+        if len(missing) < len(frames):
+            reporter.status(f"{len(frames) - len(missing)} of {len(frames)} composites exist already.")
+        for number in missing:
             target.frame_set(number)
             # Markers may bring in others.
             target.camera = camera or target.camera
-            path = out / f"composite.{number:04d}.{options.composite}"
+            path = _composite(out, number, options.composite)
             write_picture(target, path)
             reporter.status(f"Wrote {path}.")
+
+
+def _choices(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that composites depend on, as JSON holds them."""
+    size = list(options.size) if options.size else None
+    return {"camera": options.camera, "engine": options.engine, "samples": options.samples, "size": size}
+
+
+def _settled(out: Path, settings: dict[str, Any]) -> int:
+    """Return the time (ns) since which the composites in `out` were to have these settings, and store them there.
+
+    Where they are those of an earlier command, also of another computer, it is the time of that.
+    """
+    path = out / COMPOSITES
+    known = None
+    with contextlib.suppress(InputError):
+        known = read_json(path)
+    if known != settings:
+        write_json(path, settings)
+    return path.stat().st_mtime_ns
+
+
+def _is_composed(out: Path, number: int, suffix: str, since: int) -> bool:
+    """Return whether the composite of a frame exists, and is newer than its splats and settings."""
+    try:
+        made = _composite(out, number, suffix).stat().st_mtime_ns
+        return made >= since and made >= (out / PATTERN.format(number)).stat().st_mtime_ns
+    except FileNotFoundError:
+        return False
+
+
+def _composite(out: Path, number: int, suffix: str) -> Path:
+    return out / f"composite.{number:04d}.{suffix}"
 
 
 def _folder_of(root: bpy.types.Collection, blend: Path, reporter: Reporter) -> Path:

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 
 import bpy
 import numpy as np
@@ -21,6 +22,7 @@ from objectgs.backend.shared.reconstruction.shot import read_shot, write_shot
 from objectgs.objectgs_addon import film
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.film.properties import folder_of
+from objectgs.objectgs_addon.headless import filming
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.object_collection import center_of
 
@@ -762,6 +764,43 @@ def test_film_command_uses_the_folder_that_was_copied_with_the_file(shot_blend, 
     shutil.copytree(shot_blend.parent / "wall", farm / "wall")
     folder, output = used()
     assert folder == str(farm / "wall") and f"Using the folder {folder} instead" in output
+
+
+def test_film_command_renders_only_missing_composites(shot_blend, noting_backend, tmp_path, monkeypatch, capsys):
+    blend, out, written = shutil.copy(shot_blend, tmp_path), tmp_path / "out", []
+
+    def write(_scene, path):
+        written.append(path.name)
+        path.touch()
+
+    monkeypatch.setattr(filming, "write_picture", write)
+    monkeypatch.setattr(filming.filming, "set_up_compositor", lambda *_: None)
+    out.mkdir()
+    for number in (1, 2):
+        (out / f"splats.{number:04d}.exr").touch()
+
+    def composed(*words):
+        written.clear()
+        command = ["film", str(blend), "--out", str(out), "--frames", "1-2", "--composite", "png", *words]
+        assert headless.main(command) == 0
+        return [name.split(".")[1] for name in written]
+
+    def later(path, seconds):
+        os.utime(path, (time.time() + seconds,) * 2)
+
+    assert composed() == ["0001", "0002"]
+    capsys.readouterr()
+    assert composed() == [] and "2 of 2 composites exist already." in capsys.readouterr().out
+    (out / "composite.0001.png").unlink()
+    assert composed() == ["0001"]
+    later(out / "splats.0002.exr", 100)
+    assert composed() == ["0002"]
+    later(out / "splats.0002.exr", -100)
+    assert composed("--samples", "3") == ["0001", "0002"] and composed("--samples", "3") == []
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    bpy.data.objects["before"].location.x += 1
+    bpy.ops.wm.save_mainfile()
+    assert composed("--samples", "3") == ["0001", "0002"]
 
 
 @pytest.fixture
