@@ -27,17 +27,25 @@ _LONGEST_NAMES = 8000
 for everything, with a space and two quotes for each name."""
 
 
+def _package() -> str:
+    """Return the package of the user's settings: for headless.py of another folder, that of the enabled extension."""
+    names = bpy.context.preferences.addons.keys()
+    if PACKAGE.startswith("bl_ext.") or PACKAGE in names:
+        return PACKAGE
+    return next((name for name in names if name.startswith("bl_ext.") and name.endswith(".objectgs")), PACKAGE)
+
+
 def preferences() -> Any:
-    """Return the extension's preferences, or None if it is not enabled, as without a window."""
-    addon = bpy.context.preferences.addons.get(PACKAGE)
+    """Return the extension's preferences, or None if it is not enabled."""
+    addon = bpy.context.preferences.addons.get(_package())
     return addon.preferences if addon else None
 
 
 def user_folder() -> Path:
     """Return the folder for files that survive updates of the extension; it may be missing."""
     # Where Blender was to create it and could not, the path would be empty, which means the working folder.
-    if PACKAGE.startswith("bl_ext."):
-        return Path(bpy.utils.extension_path_user(PACKAGE))
+    if _package().startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(_package()))
     return Path(bpy.utils.user_resource("DATAFILES", path="objectgs"))
 
 

@@ -255,6 +255,18 @@ def test_user_folder_that_cannot_be_made_is_not_the_working_folder(tmp_path, mon
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+def test_headless_of_another_folder_uses_what_the_extension_set_up():
+    addons, own = bpy.context.preferences.addons, locations.user_folder()
+    assert not locations.PACKAGE.startswith("bl_ext.")
+    addon = addons.new()
+    try:
+        addon.module = "bl_ext.user_default.objectgs"
+        assert locations.user_folder() == Path(bpy.utils.extension_path_user(addon.module)) != own
+    finally:
+        addons.remove(addon)
+    assert locations.user_folder() == own
+
+
 def test_python_without_packages_is_reported(extension, monkeypatch, capture, tmp_path):
     """The Python of these tests has only bpy and NumPy."""
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
