@@ -19,28 +19,31 @@ def push(title: str) -> None:
 
 
 @contextmanager
-def step_for_links(root: bpy.types.Collection, title: str) -> Iterator[None]:
-    """Push an undo step if collections and objects inside `root` are meanwhile created, removed or linked elsewhere.
+def step_for_links(title: str) -> Iterator[None]:
+    """Push an undo step if objects are meanwhile moved, or collections and objects created, removed or linked elsewhere.
 
     Undo keeps data-blocks that are equal in both of its steps as they are in memory. Without a step of its own, such a
-    change would leave them with pointers to data-blocks that undo frees, and Blender would crash.
+    change would leave them with pointers to data-blocks that undo frees, and Blender would crash; or a transform would
+    be undone without the change of its mesh.
     """
-    before = _links(root)
+    before = _links()
     try:
         yield
     finally:
-        if _links(root) != before:
+        if _links() != before:
             push(title)
 
 
-def _links(root: bpy.types.Collection) -> list[Any]:
+def _links() -> list[Any]:
+    """Return what all collections of the file contain, since the user may have moved those of a reconstruction."""
     return [
         (
             _uid(collection),
             [_uid(child) for child in collection.children],
-            [(_uid(obj), _uid(obj.parent), _uid(obj.data)) for obj in collection.objects],
+            [(_uid(obj), _uid(obj.parent), _uid(obj.data), obj.matrix_basis.copy()) for obj in collection.objects],
         )
-        for collection in (root, *root.children_recursive)
+        for collection in (*bpy.data.collections, *(scene.collection for scene in bpy.data.scenes))
+        if collection.library is None
     ]
 
 

@@ -118,7 +118,7 @@ def store_edits(root: bpy.types.Collection) -> None:
     """Write pending edits to objects.json before it is read elsewhere, if the folder is accepted."""
     flush()
     if folder_trust.is_accepted(root):
-        with undo.step_for_links(root, "Duplicates"):
+        with undo.step_for_links("Transforms and Duplicates"):
             scene.store_placements(root)
 
 
@@ -299,7 +299,7 @@ def _write_colors(root: bpy.types.Collection, items: list[tuple[Any, set[str]]],
     for item, _ in items:
         _remember(item, colors_only=True)
     if is_shown and any("color" in names for _, names in items):
-        with undo.step_for_links(root, "Colors"):
+        with undo.step_for_links("Colors"):
             _show_written(root)
 
 

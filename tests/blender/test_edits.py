@@ -944,9 +944,9 @@ def test_stored_duplicates_of_blender_have_an_undo_step(root, steps, tmp_path):
     duplicated = links()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
     stored, copies = links(), entry(active()).copies
-    assert steps == ["Duplicates"] and stored != duplicated and len(copies) == 1
+    assert steps == ["Transforms and Duplicates"] and stored != duplicated and len(copies) == 1
     bpy.ops.wm.save_mainfile()
-    assert steps == ["Duplicates"], "there is nothing new to store"
+    assert steps == ["Transforms and Duplicates"], "there is nothing new to store"
     bpy.ops.ed.undo()
     assert links() == duplicated and entry(active()).copies == ()
     bpy.ops.ed.redo()
@@ -961,6 +961,45 @@ def test_stored_duplicates_of_blender_have_an_undo_step(root, steps, tmp_path):
     assert links() == stored and entry(active()).copies == copies
     bpy.ops.ed.redo()
     assert entry(active()).copies == (), "what undo shows without its pivot is no duplicate"
+
+
+def test_undo_after_saving_keeps_applied_transforms(root, steps, tmp_path):
+    """Saving gives back to the transform what Apply took from it, in the mesh and in the object at once."""
+
+    def splats():
+        return part(active(), "splats")
+
+    blender_scene.show_kinds(root, "both")
+    bpy.ops.ed.undo_push(message="begin")
+    splats().scale = 2.0, 2.0, 2.0
+    choose(splats())
+    bpy.ops.object.transform_apply(location=False, rotation=False)
+    bpy.ops.ed.undo_push(message="applied")
+    applied = seen([None, splats()])
+    splats().location.x += 1.0
+    bpy.ops.ed.undo_push(message="moved")
+    moved = seen([None, splats()])
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
+    assert steps == ["Transforms and Duplicates"] and splats().scale.x == pytest.approx(2.0)
+    for wanted in (moved, moved, applied):
+        assert stay([None, splats()], wanted)
+        bpy.ops.ed.undo()
+
+
+def test_objects_moved_to_other_collections_again_have_an_undo_step(root, steps, tmp_path):
+    """Their collection is then outside of the reconstruction's, and links change there."""
+    for name in ("Props", "More"):
+        bpy.context.scene.collection.children.link(bpy.data.collections.new(name))
+    bpy.ops.ed.undo_push(message="begin")
+    for count, name in enumerate(("Props", "More"), 1):
+        choose(*(part(active(), kind) for kind in ("object_parent", "splats")))
+        bpy.ops.object.move_to_collection(collection_uid=bpy.data.collections[name].session_uid)
+        bpy.ops.ed.undo_push(message="moved")
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
+        assert len(steps) == count and collection_of(active()) in bpy.data.collections[name].children[:]
+    bpy.ops.ed.undo()
+    bpy.ops.ed.undo()
+    assert collection_of(active()) in bpy.data.collections["Props"].children[:]
 
 
 def test_written_colors_have_an_undo_step_only_with_new_duplicates(root, steps):
