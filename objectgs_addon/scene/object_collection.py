@@ -24,6 +24,7 @@ from .object_display import Objects
 
 NAME = "objectgs_name"
 CENTER = "objectgs_center"
+"""Custom property of a pivot and of its collection: the pivot's initial position in reconstruction coordinates."""
 
 _MATERIALS = {SPLATS: SPLATS_MATERIAL, MESH: MESH_MATERIAL}
 
@@ -41,8 +42,9 @@ def ensure_pivot(
 ) -> bpy.types.Object:
     """Return the object's pivot (its own parent empty), created at the median of `positions` (n, 3) if missing.
 
-    A new one becomes the parent of parts whose pivot the user deleted. Others without a parent are left as they are,
-    since the user has cleared it.
+    A new one becomes the parent of parts whose pivot the user deleted, and is created where that was, since the
+    vertices of meshes and duplicates are relative to it. Others without a parent are left as they are, since the user
+    has cleared it.
     """
     pivot = part_of(collection, OBJECT_PARENT)
     if pivot is None:
@@ -51,7 +53,7 @@ def ensure_pivot(
         pivot.empty_display_type = "PLAIN_AXES"
         center, size = np.zeros(3), 1.0
         if len(positions):
-            center = np.median(positions, axis=0)
+            center = np.array(collection.get(CENTER, np.median(positions, axis=0)), np.float64)
             size = 0.2 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
         pivot.empty_display_size = size if parent is None else min(size, parent.empty_display_size)
         pivot[CENTER] = center.tolist()
@@ -61,6 +63,7 @@ def ensure_pivot(
             if part.parent is None:
                 part.parent = pivot
         collection.objects.link(pivot)
+    collection[CENTER] = center_of(pivot).tolist()
     return pivot
 
 

@@ -320,6 +320,23 @@ def test_meshes_are_parented_to_restored_pivots(root, folder):
     assert len(mesh_of(root, 2).data.polygons) == 4
 
 
+def test_restored_pivots_are_where_meshes_expect_them(root, folder):
+    """The median of the splats changes with each training, and meshes are not read again."""
+    mesh_of(root, 1).data.vertices[0].co.x += 5.0
+    bpy.context.view_layer.update()
+    before = [coordinates(parts(root, 1, kind)[0]) for kind in ("mesh", "splats")]
+    splats = splat_table(np.resize([0, *OBJECTS], 40))
+    for axis, name in enumerate("xyz"):
+        splats[name] += ORIGIN[axis] + 0.25
+    write_vertices(folder / "splats.ply", splats)
+    bpy.data.objects.remove(parts(root, 1, "object_parent")[0])
+    blender_scene.show_result(root, folder)
+    bpy.context.view_layer.update()
+    after = [coordinates(parts(root, 1, kind)[0]) for kind in ("mesh", "splats")]
+    assert after[0] == pytest.approx(before[0], abs=2e-6)
+    assert np.linalg.norm(after[1] - before[1], axis=1) == pytest.approx(0.25 * np.sqrt(3), abs=1e-3)
+
+
 def test_mesh_names_and_colors_follow_objects(root, folder):
     edit_objects(folder / "objects.json", {1: dict(name="cup", color=[255, 0, 0])})
     blender_scene.show_objects(root, folder)
