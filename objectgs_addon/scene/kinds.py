@@ -69,6 +69,13 @@ def mark(block: bpy.types.ID, kind: str, object_id: int | None = None) -> None:
         block[OBJECT_ID] = to_stored(object_id)
 
 
+def release(block: bpy.types.ID) -> None:
+    """Leave a copy of the add-on's data-block to the user; the add-on no longer changes or removes it."""
+    for name in (KIND, OBJECT_ID, MESH_KEY):
+        if name in block:
+            del block[name]
+
+
 def to_stored(object_id: int) -> int:
     """Convert an object ID (0 .. 2^32 - 1) to the signed 32-bit integer with the same bits, as Blender stores it."""
     return object_id - (1 << 32) if object_id >= 1 << 31 else object_id

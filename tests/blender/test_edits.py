@@ -786,6 +786,28 @@ def test_objects_moved_to_other_collections_take_their_own_along(root, parts_sho
     assert set(parts_shown[2].users_collection) == {own, places[0]} and len(bpy.data.objects) == count
 
 
+def test_copied_meshes_are_left_to_the_user(root, folder, parts_shown):
+    """A copy that was saved beside its mesh does not take its place."""
+    place = bpy.data.collections.new("Retopo")
+    bpy.context.scene.collection.children.link(place)
+    choose(parts_shown[2])
+    bpy.ops.object.duplicate()
+    copy = bpy.context.active_object
+    bpy.ops.object.move_to_collection(collection_uid=place.session_uid)
+    blender_scene.store_placements(root)
+    copy.data.vertices[0].co.x += 5.0
+    bpy.data.objects.remove(parts_shown[2])
+    blender_scene.store_placements(root)
+    write_meshes(folder, {"1": tetrahedron(ORIGIN, 2.0)})
+    show_again(root)
+    assert copy.users_collection == (place,) and blender_scene.kind_of(copy) is None
+    assert part(root, "mesh") is not None and part(root, "mesh") != copy
+    assert copy.data.vertices[0].co.x - part(root, "mesh").data.vertices[0].co.x > 3.0
+    edit_objects(folder / "objects.json", {1: {"merged_into": 2}})
+    show_again(root)
+    assert copy.users_collection == (place,)
+
+
 def test_objects_parented_to_others_are_placed(root, folder, parts_shown):
     holder = bpy.data.objects.new("holder", None)
     bpy.context.scene.collection.objects.link(holder)

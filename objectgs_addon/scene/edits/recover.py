@@ -29,6 +29,7 @@ from ..kinds import (
     parent_of,
     part_of,
     parts_of,
+    release,
 )
 from .placement import take_back
 
@@ -38,7 +39,8 @@ _PARTS = (OBJECT_PARENT, SPLATS, ANCHORS, MESH)
 def recover_parts(root: bpy.types.Collection) -> None:
     """Link parts that the user moved to other collections to those of their objects, and restore changed splats.
 
-    A whole object takes its collection along. A single part stays in the user's collection, too.
+    A whole object takes its collection along. A single part stays in the user's collection, too. A copy of a mesh that
+    is still in its collection is left to the user, also when that mesh is deleted later.
     """
     _link_parts(root)
     for collection in chain(object_collections(root).values(), *duplicates_of(root).values()):
@@ -51,6 +53,7 @@ def recover_parts(root: bpy.types.Collection) -> None:
 def _link_parts(root: bpy.types.Collection) -> None:
     parent = parent_of(root)
     homes = [each for each in bpy.data.collections if kind_of(each) in (OBJECT, DUPLICATE) and not is_linked(each)]
+    shown = [part for home in object_collections(root).values() for part in home.objects]
     at_home = {part for home in homes for part in home.objects if object_id_of(part) == object_id_of(home)}
     moved = [
         part
@@ -65,6 +68,8 @@ def _link_parts(root: bpy.types.Collection) -> None:
     for part in sorted(moved, key=lambda part: kind_of(part) != OBJECT_PARENT) if parent is not None else ():
         home = _home_of(part, root, homes)
         if home is None:
+            if kind_of(part) == MESH and any(_is_twin(part, other) for other in shown):
+                release(part)
             continue
         before = part.users_collection
         home.objects.link(part)
@@ -105,6 +110,10 @@ def _move_collection(home: bpy.types.Collection, places: tuple[bpy.types.Collect
             each.children.link(home)
     for each in former if wanted else ():
         each.children.unlink(home)
+
+
+def _is_twin(part: bpy.types.Object, other: bpy.types.Object) -> bool:
+    return object_id_of(part) == object_id_of(other) and _key(part) == _key(other)
 
 
 def _key(part: bpy.types.Object) -> tuple:
