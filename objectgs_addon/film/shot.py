@@ -318,19 +318,23 @@ def _instances_of(
 
 def _instance_of(obj: bpy.types.Object, paths: Any, whole: tuple, instancer: Any = None) -> _SplatsInstance | None:
     """Return a splat carrier as an instance, None if it belongs to no object; whole: the meshes of the whole scene."""
-    collections = list(obj.users_collection)
+    collections, object_id = list(obj.users_collection), object_id_of(obj)
+
+    def is_own(above: bpy.types.Object | None) -> bool:
+        # The user may have parented a part to the pivot of another object.
+        return kind_of(above) == OBJECT_PARENT and object_id_of(above) == object_id
+
     pivot = (
         obj.parent
-        if kind_of(obj.parent) == OBJECT_PARENT
+        if is_own(obj.parent)
         else next(
             (pivot for collection in collections if (pivot := part_of(collection, OBJECT_PARENT)) is not None), None
         )
     )
-    object_id = object_id_of(obj)
     if pivot is None or object_id is None:
         return None
     # The user may have given a mesh another parent, or moved it to another collection.
-    apart = [part for each in collections for part in each.objects if kind_of(part.parent) != OBJECT_PARENT]
+    apart = [part for each in collections for part in each.objects if not is_own(part.parent)]
     meshes = [part for part in {*pivot.children, *apart} if kind_of(part) == MESH and object_id_of(part) == object_id]
     if object_id == 0:
         meshes += whole

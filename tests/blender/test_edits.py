@@ -834,6 +834,25 @@ def test_objects_parented_to_others_are_placed(root, folder, parts_shown):
     assert entry(root).transform is None and stay(parts_shown, before)
 
 
+def test_objects_parented_to_pivots_of_others_are_placed(root, folder, parts_shown):
+    """They are parts of their object, not of a copy that the other pivot belongs to."""
+    before, tray = seen(parts_shown), part(root, "object_parent", 2)
+    choose(tray, *parts_shown)
+    bpy.ops.object.parent_set(type="OBJECT", keep_transform=True)
+    assert {obj.parent for obj in parts_shown} == {tray}
+    blender_scene.store_placements(root)
+    assert entry(root).transform is None and stay(parts_shown, before)
+    wanted = np.eye(4)
+    wanted[:3, 3] = 0.0, 0.0, 2.0
+    there = independent(root, parts_shown[1]) + wanted[:3, 3]
+    edit_objects(folder / "objects.json", {1: {"transform": wanted.tolist()}})
+    show_again(root)
+    assert independent(root, parts_shown[1]) == pytest.approx(there, abs=1e-4)
+    assert blender_scene.placement_of(root, collection_of(root)) == pytest.approx(wanted, abs=1e-4)
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert entry(root).transform is None and stay(parts_shown, before)
+
+
 # Undo.
 
 

@@ -84,7 +84,7 @@ def splats_of(root, object_id):
 def captured(splats) -> np.ndarray:
     """Return the capture coordinates (n, 3) of the object's splats."""
     vertices = np.array([vertex.co for vertex in splats.data.vertices], np.float64)
-    return vertices + center_of(splats.parent) + ORIGIN
+    return vertices + center_of(kinds.part_of(kinds.collection_of(splats), "object_parent")) + ORIGIN
 
 
 def seen(shot, sample, points) -> np.ndarray:
@@ -273,6 +273,18 @@ def test_objects_hidden_in_renders_are_omitted(root):
     scene.frame_set(1)
     objects = [set(frame.samples[0].objects) for frame in shoot(root, (1, 2, 3)).frames]
     assert objects == [ids - {0, 1, 2}, ids - {0, 1, 2}, ids - {1, 2}]
+
+
+def test_objects_parented_to_the_pivot_of_another_are_placed(root):
+    splats = splats_of(root, 1)
+    for part in (ensure_pivot(root, 1), splats):
+        world = part.matrix_world.copy()
+        part.parent = ensure_pivot(root, 2)
+        part.matrix_world = world
+    ensure_pivot(root, 2).location.x += 0.3
+    bpy.context.view_layer.update()
+    shot = shoot(root)
+    assert_placed(root, shot, shot.frames[0].samples[0], 1, splats)
 
 
 def test_objects_below_others_are_filmed(root):

@@ -55,12 +55,12 @@ def is_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> bo
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:
     """Move an object so that `placement_of` returns `place`; None restores the captured pose.
 
-    This moves the pivot, and parts that the user has given another parent or none.
+    This moves the pivot, and parts that the user has given another parent, also that of another object, or none.
     """
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
-    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if _pivot_above(part) is None}
+    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if _pivot_above(part) != pivot}
     moved = np.eye(4) if place is None else about(np.asarray(place, np.float64), -origin_of(root))
     wanted = moved @ _shift(_rest(pivot)) @ np.linalg.inv(_own(collection, pivot))
     if pivot.parent is not None:
@@ -161,7 +161,8 @@ def _own(collection: bpy.types.Collection, pivot: bpy.types.Object) -> np.ndarra
 def _own_parts(collection: bpy.types.Collection, pivot: bpy.types.Object) -> list[bpy.types.Object]:
     """Return the parts of the object with this pivot, without those of copies that the user made with Blender."""
     parts = [part for part in parts_of(collection) if kind_of(part) in (SPLATS, ANCHORS, MESH)]
-    return [part for part in parts if _pivot_above(part) in (pivot, None)]
+    others = {other for other in parts_of(collection) if kind_of(other) == OBJECT_PARENT and other != pivot}
+    return [part for part in parts if _pivot_above(part) not in others]
 
 
 def _pivot_above(part: bpy.types.Object) -> bpy.types.Object | None:
