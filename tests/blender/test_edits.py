@@ -853,6 +853,38 @@ def test_objects_parented_to_pivots_of_others_are_placed(root, folder, parts_sho
     assert entry(root).transform is None and stay(parts_shown, before)
 
 
+@pytest.mark.parametrize("is_alone", [False, True], ids=["whole", "alone"])
+@pytest.mark.parametrize("with_holder", [False, True], ids=["cleared", "held"])
+def test_duplicates_of_objects_without_pivots_above_are_stored_once(root, parts_shown, is_alone, with_holder):
+    parts_shown[0].location.x += 1.0
+    parts_shown[0].rotation_euler.z = 0.5
+    if with_holder:
+        holder = bpy.data.objects.new("holder", None)
+        bpy.context.scene.collection.objects.link(holder)
+        holder.rotation_euler.x, holder.location.y, holder.parent = 0.5, 2.0, kinds.parent_of(root)
+        choose(holder, *parts_shown)
+        bpy.ops.object.parent_set(type="OBJECT", keep_transform=True)
+    else:
+        choose(*parts_shown)
+        bpy.ops.object.parent_clear(type="CLEAR_KEEP_TRANSFORM")
+    choose(*(parts_shown[1:2] if is_alone else parts_shown))
+    before = independent(root, parts_shown[1])
+    bpy.ops.object.duplicate()
+    for obj in bpy.context.selected_objects:
+        obj.location.z += 2.0
+    twin = next(obj for obj in bpy.context.selected_objects if blender_scene.kind_of(obj) == "splats")
+    there = independent(root, twin)
+    blender_scene.store_placements(root)
+    (copy,), (stored,) = blender_scene.duplicates_of(root)[1], entry(root).copies
+    own = [sorted(map(blender_scene.kind_of, each.objects)) for each in (collection_of(root), copy)]
+    assert own == [["anchors", "mesh", "object_parent", "splats"]] * 2
+    assert independent(root, kinds.part_of(copy, "splats")) == pytest.approx(there, abs=1e-4)
+    captured = before - np.array(entry(root).transform)[:3, 3]
+    captured = captured @ np.linalg.inv(np.array(entry(root).transform)[:3, :3]).T
+    moved = captured @ np.array(stored)[:3, :3].T + np.array(stored)[:3, 3]
+    assert moved == pytest.approx(there, abs=1e-3)
+
+
 # Undo.
 
 

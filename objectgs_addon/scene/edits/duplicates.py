@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..kinds import (
     ANCHORS,
@@ -24,7 +25,7 @@ from ..kinds import (
     parts_of,
 )
 from ..object_collection import NAME
-from .placement import PLACEMENT, placement_of, set_placement
+from .placement import PLACEMENT, matrix_to_world, pivot_above, placement_of, set_local_map, set_placement
 
 DUPLICATES = "objectgs_copies"
 """Custom property of an object's collection: placements of its duplicates at the last sync with objects.json (JSON)."""
@@ -80,9 +81,10 @@ def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
         if kind_of(collection) not in (OBJECT, DUPLICATE):
             continue
         pivots = [obj for obj in collection.objects if kind_of(obj) == OBJECT_PARENT]
+        parts = _parts_by_pivot(collection, pivots)
         for pivot in pivots[1:]:
             copy = _new_collection(root, collection)
-            for obj in [pivot, *(child for child in pivot.children if child in collection.objects[:])]:
+            for obj in [pivot, *parts[pivot]]:
                 copy.objects.link(obj)
                 collection.objects.unlink(obj)
         splats = [obj for obj in collection.objects if kind_of(obj) == SPLATS]
@@ -92,11 +94,33 @@ def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
             collection.objects.unlink(obj)
             pivot = pivots[0].copy()
             copy.objects.link(pivot)
+            own = np.linalg.inv(matrix_to_world(pivot)) @ matrix_to_world(obj)
             obj.parent = pivot
+            set_local_map(obj, own)
             place = placement_of(root, copy)
             obj.matrix_parent_inverse.identity()
             obj.matrix_basis.identity()
             set_placement(root, copy, place)
+
+
+def _parts_by_pivot(
+    collection: bpy.types.Collection, pivots: list[bpy.types.Object]
+) -> dict[bpy.types.Object, list[bpy.types.Object]]:
+    """Map the pivots in a collection to their children and, if the user has cleared or changed those, to other parts.
+
+    Parts below none of the pivots are in their order, as they were duplicated together. A mesh with another parent than
+    the splats serves another purpose.
+    """
+    inside = collection.objects[:]
+    found = {pivot: [child for child in pivot.children if child in inside] for pivot in pivots}
+    apart = [obj for obj in inside if kind_of(obj) in (*_CARRIERS, MESH) and pivot_above(obj) not in pivots]
+    above = {obj.parent for obj in apart if kind_of(obj) == SPLATS}
+    apart = [obj for obj in apart if kind_of(obj) != MESH or obj.parent in above]
+    for key in dict.fromkeys(map(_key, apart)):
+        waiting = [pivot for pivot in pivots if key not in map(_key, found[pivot])]
+        for pivot, obj in zip(waiting, [obj for obj in apart if _key(obj) == key]):
+            found[pivot].append(obj)
+    return found
 
 
 def bring_up_to_date(root: bpy.types.Collection) -> None:
@@ -118,6 +142,8 @@ def _follow(source: Any, copy: Any) -> None:
         if twin is None:
             twin = obj.copy()
             twin.parent = pivot
+            if pivot is not None and pivot_above(obj) not in source.objects[:]:
+                _move_beside(twin, obj, source, copy)
             copy.objects.link(twin)
         elif kind_of(obj) in _CARRIERS and twin.data != obj.data:
             old, twin.data = twin.data, obj.data
@@ -126,6 +152,16 @@ def _follow(source: Any, copy: Any) -> None:
         twin.hide_viewport, twin.hide_render = obj.hide_viewport, obj.hide_render
     for gone in there.values():
         bpy.data.objects.remove(gone)
+
+
+def _move_beside(twin: bpy.types.Object, obj: bpy.types.Object, source: Any, copy: Any) -> None:
+    """Move the twin of a part that has lost its pivot to where the part is relative to the splats, or else the pivot."""
+    pairs = ((part_of(source, kind), part_of(copy, kind)) for kind in (SPLATS, OBJECT_PARENT))
+    for base, other in pairs:
+        if base is not None and other is not None:
+            local = np.linalg.inv(matrix_to_world(base)) @ matrix_to_world(obj)
+            set_local_map(twin, np.linalg.inv(matrix_to_world(twin.parent)) @ matrix_to_world(other) @ local)
+            return
 
 
 def _key(obj: bpy.types.Object) -> tuple:

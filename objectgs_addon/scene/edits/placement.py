@@ -60,17 +60,17 @@ def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, 
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
-    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if _pivot_above(part) != pivot}
+    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if pivot_above(part) != pivot}
     moved = np.eye(4) if place is None else about(np.asarray(place, np.float64), -origin_of(root))
     wanted = moved @ _shift(_rest(pivot)) @ np.linalg.inv(_own(collection, pivot))
     if pivot.parent is not None:
         wanted = np.linalg.inv(_map(pivot.parent, parent)) @ wanted
     else:
         wanted = _map(parent, None) @ wanted
-    _place(pivot, wanted)
+    set_local_map(pivot, wanted)
     for part, own in apart.items():
         world = matrix_to_world(pivot) @ own
-        _place(part, world if part.parent is None else np.linalg.inv(matrix_to_world(part.parent)) @ world)
+        set_local_map(part, world if part.parent is None else np.linalg.inv(matrix_to_world(part.parent)) @ world)
 
 
 def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> None:
@@ -78,14 +78,14 @@ def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection
     pivot = part_of(collection, OBJECT_PARENT)
     for part in _own_parts(collection, pivot) if pivot is not None else ():
         part.parent = pivot
-        _place(part, np.linalg.inv(carrier.applied_map(part.data)))
+        set_local_map(part, np.linalg.inv(carrier.applied_map(part.data)))
     set_placement(root, collection, None)
 
 
 def attach(part: bpy.types.Object, pivot: bpy.types.Object | None) -> None:
     """Give a part another pivot, and keep how the user has moved it relative to the previous one."""
     if kind_of(part.parent) != OBJECT_PARENT:
-        _place(part, np.eye(4))
+        set_local_map(part, np.eye(4))
     part.parent = pivot
 
 
@@ -98,7 +98,7 @@ def move_to_transforms(mesh: bpy.types.Mesh) -> None:
     if np.array_equal(applied, np.eye(4)):
         return
     for obj in [obj for obj in bpy.data.objects if obj.data == mesh]:
-        _place(obj, _map(obj, obj.parent) @ applied)
+        set_local_map(obj, _map(obj, obj.parent) @ applied)
 
 
 def take_back(mesh: bpy.types.Mesh) -> None:
@@ -162,17 +162,18 @@ def _own_parts(collection: bpy.types.Collection, pivot: bpy.types.Object) -> lis
     """Return the parts of the object with this pivot, without those of copies that the user made with Blender."""
     parts = [part for part in parts_of(collection) if kind_of(part) in (SPLATS, ANCHORS, MESH)]
     others = {other for other in parts_of(collection) if kind_of(other) == OBJECT_PARENT and other != pivot}
-    return [part for part in parts if _pivot_above(part) not in others]
+    return [part for part in parts if pivot_above(part) not in others]
 
 
-def _pivot_above(part: bpy.types.Object) -> bpy.types.Object | None:
+def pivot_above(part: bpy.types.Object) -> bpy.types.Object | None:
+    """Return the pivot that a part is parented to, also through other objects; None without one."""
     above = part.parent
     while above is not None and kind_of(above) != OBJECT_PARENT:
         above = above.parent
     return above
 
 
-def _place(obj: bpy.types.Object, wanted: np.ndarray) -> None:
+def set_local_map(obj: bpy.types.Object, wanted: np.ndarray) -> None:
     """Set the map from an object's local coordinates to those of its parent or, without one, the world, (4, 4)."""
     needed = Matrix(wanted.tolist())
     location, rotation, scale = needed.decompose()
