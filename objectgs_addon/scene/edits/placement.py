@@ -19,7 +19,7 @@ EXACT = 1e-5
 """Largest relative error of a map as location, rotation and scale; beyond it, the parent inverse stores the rest."""
 
 ROUNDING = 1e-6
-"""Largest difference of two transforms that counts as rounding, relative to their largest number."""
+"""Largest difference of two transforms that counts as rounding, relative to their largest number or 1."""
 
 
 def local_placement(root: bpy.types.Collection, collection: bpy.types.Collection) -> np.ndarray | None:
@@ -49,7 +49,7 @@ def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -
 def is_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> bool:
     """Return whether an object is not where it was captured."""
     place = placement_of(root, collection)
-    return place is not None and not np.array_equal(place, np.eye(4))
+    return place is not None and not np.allclose(about(place, -origin_of(root)), np.eye(4), ROUNDING, ROUNDING)
 
 
 def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, place: np.ndarray | None) -> None:

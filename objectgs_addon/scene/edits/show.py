@@ -24,7 +24,7 @@ from ..object_display import Objects
 from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
 from .fills import show_fills
 from .floaters import hide_floaters
-from .placement import PLACEMENT, about, local_placement, placement_of, rest_placement, set_placement
+from .placement import PLACEMENT, ROUNDING, about, local_placement, placement_of, rest_placement, set_placement
 from .recolor import recolor_of, set_recolor
 from .recover import recover_parts
 
@@ -35,7 +35,8 @@ REMOVED = "objectgs_removed"
 def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     """Apply removals, recoloring, placements and duplicates from objects.json.
 
-    Objects that the user has moved since keep their placement, unless the placement in objects.json has changed.
+    Objects that the user has moved since keep their placement, unless the placement in objects.json has changed. Copies
+    made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step.
 
     Args:
         root: the reconstruction's collection.
@@ -44,14 +45,17 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     Raises:
         InputError: Splats that would change are in Edit Mode.
     """
-    recover_parts(root)
+    is_free = bpy.context.mode == "OBJECT"
+    if is_free:
+        recover_parts(root)
     collections = object_collections(root)
     entries = objects.entries.values()
     hiding = {entry.id for entry in entries if entry.cleaned}
     hiding |= {0 for entry in entries if entry.removed and entry.floaters}
     carrier.require_object_mode(part_of(collections[object_id], SPLATS) for object_id in hiding & collections.keys())
     show_fills(root, objects)
-    adopt_blender_duplicates(root)
+    if is_free:
+        adopt_blender_duplicates(root)
     bring_up_to_date(root)
     copies = duplicates_of(root)
     for object_id, collection in collections.items():
@@ -283,6 +287,6 @@ def _same(root: bpy.types.Collection, first: Any, second: Any) -> bool:
             continue  # Usually both are None.
         # Far from the origin, the translation of a map that turns or scales is much larger than the object's move.
         one, other = (about(np.array(_IDENTITY if each is None else each, float), -origin) for each in (one, other))
-        if not np.allclose(one, other, rtol=1e-6, atol=1e-6):
+        if not np.allclose(one, other, ROUNDING, ROUNDING):
             return False
     return True
