@@ -232,7 +232,7 @@ def remove(root: bpy.types.Collection, object_ids: Iterable[int], floaters: bool
 
 def restore(root: bpy.types.Collection, object_ids: Iterable[int]) -> None:
     """Show removed objects again, unchanged."""
-    _show_edit(root, {object_id: {"removed": None, "floaters": None, "fill": None} for object_id in object_ids})
+    _show_edit(root, {object_id: object_list.restored(root, object_id) for object_id in object_ids})
 
 
 def fill_hole(root: bpy.types.Collection, object_id: int, is_filled: bool) -> None:
@@ -380,8 +380,8 @@ def _row_changed(item: Any, **changes: Any) -> None:
     if not folder_trust.is_accepted(root):
         _show_label(item)
         return
-    flush()
     try:
+        store_edits(root)
         _require_object_mode(root)
         edit_objects(Reconstruction(scene.folder_of(root)).objects, {from_stored(item.object_id): changes})
     except (InputError, OSError) as error:

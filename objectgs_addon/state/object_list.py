@@ -115,6 +115,13 @@ def rounded(recolor: Recolor | None) -> Recolor:
     )
 
 
+def restored(root: bpy.types.Collection, object_id: int) -> dict[str, None]:
+    """Return the fields of objects.json to reset to restore an object; the hole of one that is moved stays filled."""
+    collection = scene.object_collections(root).get(object_id)
+    is_moved = collection is not None and scene.is_moved(root, collection)
+    return dict.fromkeys(("removed", "floaters") if is_moved else ("removed", "floaters", "fill"))
+
+
 def rgb_of(item: Any) -> list[int]:
     """Return the color of a row, sRGB 0 .. 255."""
     return [round(255 * channel) for channel in item.color]

@@ -42,6 +42,7 @@ class FillHole(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
         object_id = scene.from_stored(object_list.shown_item(root).object_id)
+        object_edits.store_edits(root)  # The hole is that of an object that is stored as moved.
         object_edits.fill_hole(root, object_id, self.filled)
 
 

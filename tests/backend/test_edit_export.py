@@ -75,6 +75,8 @@ def test_objects_are_removed_and_restored_by_name_or_id(run_command, folder):
     assert "1 mug: removed with floaters\n" in status and "3 box: as captured\n" in status
     filled = run_command("edit", folder.folder, "--remove", "mug", "--fill").out
     assert "1 mug: removed, its hole not filled, since there is no flat surface around it" in filled
+    run_command("edit", folder.folder, "--remove", "mug")
+    assert edited(folder, 1).fill, "the hole stays filled"
     run_command("edit", folder.folder, "--restore", "mug", "box")
     assert [entry.removed for entry in read_objects(folder.objects)] == [False, True, False, True]
     assert json.loads(folder.objects.read_text())["edits"].keys() == {"2", "7"}
@@ -113,7 +115,10 @@ def test_fills_are_cached_per_edit_state(run_command, folder):
     run_command("edit", folder.folder, "--restore", "mug")
     moved = run_command("edit", folder.folder, "--move", "mug:x=1", "--fill").out
     assert path() != first and f"1 mug: its hole filled with {count} new splats, moved" in moved
-    run_command("edit", folder.folder, "--remove", "mug", "--fill")
+    run_command("edit", folder.folder, "--remove", "mug")
+    run_command("edit", folder.folder, "--restore", "mug")
+    assert edited(folder, 1).fill and not edited(folder, 1).removed, "the hole of a moved object stays filled"
+    run_command("edit", folder.folder, "--remove", "mug")
     for i in range(12):
         (folder.cache / f"fill-{i}.ply").touch()
     write_splats(folder.splats, splats.select(np.arange(len(splats)) > 0))

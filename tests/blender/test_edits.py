@@ -410,6 +410,13 @@ def test_a_move_of_a_turned_object_far_from_the_origin_is_stored(root):
     assert np.abs(moved[:3, :3]).max() == 0 and np.linalg.norm(moved[:3, 3]) == pytest.approx(0.5, abs=1e-4)
 
 
+def test_rounding_is_not_a_move(root):
+    part(root, "object_parent").location.x += 3e-7
+    assert "Not moved" in texts_of(EditPanel) and not blender_scene.is_moved(root, collection_of(root))
+    part(root, "object_parent").location.x += 3e-4
+    assert blender_scene.is_moved(root, collection_of(root))
+
+
 def test_unmoved_objects_keep_exact_transform(root, folder):
     before = (folder / "objects.json").read_bytes()
     for collection in blender_scene.object_collections(root).values():
@@ -610,6 +617,15 @@ def test_an_older_blend_can_show_what_another_moved(root, folder, tmp_path):
     assert moved == pytest.approx(np.array(stored.transform), abs=1e-4)
     assert len(blender_scene.duplicates_of(active())[2]) == 1
     assert entry(active()).transform is not None and entry(active(), 2) == stored
+
+
+def test_objects_left_out_keep_their_move(root):
+    part(root, "object_parent").location.x += 1.0
+    item(root).chosen = False
+    assert 1 not in blender_scene.object_collections(root) and entry(root).left_out
+    assert entry(root).transform is not None
+    item(root).chosen = True
+    assert np.array(entry(root).transform) == pytest.approx(blender_scene.placement_of(root, collection_of(root)))
 
 
 @pytest.fixture
@@ -1080,6 +1096,14 @@ def test_written_colors_have_an_undo_step_only_with_new_duplicates(root, steps):
     item(active()).color = (1.0, 0.0, 0.0)
     assert steps == []
     duplicate_in_blender()
+    holder = bpy.data.objects.new("holder", bpy.data.meshes.new("holder"))
+    bpy.context.scene.collection.objects.link(holder)
+    bpy.context.view_layer.objects.active = holder
+    bpy.ops.object.mode_set(mode="EDIT")
+    duplicated = links()
+    item(active()).color = (0.0, 0.0, 1.0)
+    assert steps == [] and links() == duplicated, "Edit Mode has undo steps of its own"
+    bpy.ops.object.mode_set(mode="OBJECT")
     item(active()).color = (0.0, 1.0, 0.0)
     assert steps == ["Colors"] and len(blender_scene.duplicates_of(active())[1]) == 1
 
@@ -1357,10 +1381,13 @@ def test_hole_of_moved_object_is_filled(ground, root):
     bpy.ops.objectgs.fill_hole()
     filled = surface(root)
     assert filled != captured and entry(root).fill and not blender_scene.is_removed(collection_of(root))
+    assert entry(root).transform is not None, "another program sees why there is a hole"
     assert "splats fill the hole" in texts_of(EditPanel)
     bpy.ops.objectgs.remove_object()
     assert surface(root) == filled, "the hole stays filled"
     bpy.ops.objectgs.restore_object(object="1")
+    assert surface(root) == filled and entry(root).fill and not entry(root).removed
+    bpy.ops.objectgs.fill_hole(filled=False)
     assert surface(root) == captured
     bpy.ops.objectgs.fill_hole()
     assert surface(root) == filled

@@ -63,9 +63,13 @@ def _changes(options: argparse.Namespace, wanted: _Edits) -> dict[int, dict[str,
     for entry in wanted.find_or_all(options.reset):
         wanted.change(entry, **_NONE)
     for entry in wanted.find(options.restore):
-        wanted.change(entry, removed=None, floaters=None, fill=None)
+        wanted.change(entry, removed=None, floaters=None)
+        if entry.transform is None:
+            wanted.change(entry, fill=None)
     for entry in wanted.find(options.remove):
-        wanted.change(entry, removed=True, floaters=options.floaters or None, fill=options.fill or None)
+        wanted.change(entry, removed=True, floaters=options.floaters or None)
+        if options.fill:
+            wanted.change(entry, fill=True)
     for entry in wanted.find_or_all(options.restore_floaters):
         wanted.change(entry, cleaned=None)
     for entry in wanted.find_or_all(options.clean_floaters):
