@@ -23,8 +23,8 @@ class Message:
     Attributes:
         text: one or more sentences.
         kind: INFO or ERROR.
-        operator: operator of the button that helps, or None.
-        label: text of the button.
+        operator: operator that helps, or None.
+        label: text of its button; empty for none.
         options: properties of the operator.
     """
 

@@ -101,7 +101,7 @@ def draw_message(layout: bpy.types.UILayout) -> None:
     row = box.row()
     write(row.column(), message.text, message.kind, inset=_BOX)
     row.operator("objectgs.dismiss_message", text="", icon="X", emboss=False)
-    if message.operator is not None:
+    if message.operator is not None and message.label:
         button = box.operator(message.operator, text=message.label)
         for name, value in message.options.items():
             setattr(button, name, value)

@@ -11,7 +11,6 @@ from typing import Any
 import bpy
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.reconstruction.folder import Reconstruction
 from .. import scene
 from ..blender import messages, writing
 from ..state import folder_trust, object_edits, object_list, splat_edits
@@ -87,6 +86,7 @@ def _file_loaded(*_: Any) -> None:
     """
     splat_edits.forget()
     messages.settle("", _RELOAD)
+    older = []
     for owner in bpy.data.scenes:
         roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
         roots = [root for root in roots if not scene.is_linked(root)]
@@ -98,16 +98,12 @@ def _file_loaded(*_: Any) -> None:
                 if not root.objectgs.objects:
                     object_edits.fill(root)
                 elif not object_list.shows_edits(root):
-                    _tell_newer_edits(root)
-
-
-def _tell_newer_edits(root: bpy.types.Collection) -> None:
-    path = Reconstruction(scene.folder_of(root)).objects
-    text = f"{root.name} does not show the edits in {path}, which exports use; use Reload Result to show them."
-    if root == bpy.context.scene.objectgs.active:
-        messages.show(text, operator=_RELOAD, label="Reload Result")
-    else:
-        messages.show(text)
+                    older.append(root)
+    active = bpy.context.scene.objectgs.active
+    for root in sorted(older, key=lambda root: root == active):
+        # The button acts on the active reconstruction, whose message is the latest.
+        label = "Reload Result" if root == active else ""
+        messages.show(object_list.newer_edits(root), operator=_RELOAD, label=label)
 
 
 def register() -> None:

@@ -158,12 +158,22 @@ def state_of(root: bpy.types.Collection) -> State:
 def shows_edits(root: bpy.types.Collection) -> bool:
     """Return whether the list, the places and the duplicates are those that objects.json had at the last sync.
 
+    A missing file or folder has no other edits.
+
     Raises:
         InputError: objects.json cannot be used.
     """
     path = Reconstruction(scene.folder_of(root)).objects
-    entries = read_objects(path) if path.exists() else []
+    if not path.exists():
+        return True
+    entries = read_objects(path)
     return _rows_of(root) == {entry.id: row_of(entry) for entry in entries} and scene.shows_places(root, entries)
+
+
+def newer_edits(root: bpy.types.Collection) -> str:
+    """Return the message that a reconstruction does not show the edits in its folder."""
+    path = Reconstruction(scene.folder_of(root)).objects
+    return f"{root.name} does not show the edits in {path}, which exports use; use Reload Result to show them."
 
 
 def _rows_of(root: bpy.types.Collection) -> dict[int, dict[str, Any]]:

@@ -5,6 +5,7 @@ import bpy
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.blender import messages
+from ...objectgs_addon.state import object_list
 from ..common import need
 from ..common.reporting import reports_errors
 from ..common.show_folder import show_folder
@@ -26,7 +27,7 @@ class ShowResult(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
         show_folder(self, context, scene.folder_of(root), root)
-        messages.settle(root.name, ShowResult.bl_idname)
+        messages.withdraw(object_list.newer_edits(root))
 
 
 CLASSES = (ShowResult,)

@@ -667,6 +667,28 @@ def test_opening_an_older_blend_tells_of_newer_edits(root, folder, tmp_path, tol
     assert len(told) == 1
 
 
+def test_messages_about_newer_edits_name_each_reconstruction(root, folder, tmp_path, told):
+    """The active one is the latest, since its button acts on it; those of others stay when it is pressed."""
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    bpy.ops.objectgs.open_reconstruction(directory=str(other))
+    bpy.context.scene.objectgs.active = root
+    path = str(tmp_path / "some.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    for each in (folder, other):
+        edit_objects(each / "objects.json", {1: {"removed": True}})
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert [str(place / "objects.json") in text for (text, _), place in zip(told, (other, folder))] == [True, True]
+    shown = [messages.Message(text, operator=operator) for text, operator in told]
+    messages._messages[:] = shown
+    show_again(active())
+    assert messages._messages == shown[:1]
+    shutil.rmtree(other)
+    show_again(active())
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.open_mainfile(filepath=path)
+    assert len(told) == 2 and not messages._messages, "a missing folder has no newer edits"
+
+
 def test_edits_of_rows_show_in_the_list_what_another_program_wrote(root, folder):
     edit_objects(folder / "objects.json", {1: {"removed": True}})
     item(root, 2).name = "crate"
