@@ -13,7 +13,7 @@ import bpy
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.record import read_record
 from .. import film, scene
-from ..blender import messages
+from ..blender import messages, undo
 from ..environment import known_folders, locations
 from ..picking import marks
 from ..process.jobs import Job
@@ -147,9 +147,10 @@ def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
 
 
 def _show_fill_job(job: Job, _owner: bpy.types.Scene | None) -> bool:
-    """Show the fill without an undo step; undoing the edits also undoes the fill."""
+    """Show the fill, without an undo step unless it moves splats; undoing the edits also undoes the fill."""
     for root in _shown_roots(job, None):
-        show_fill(root)
+        with undo.step_for_links("Fill"):
+            show_fill(root)
     return False
 
 

@@ -26,7 +26,7 @@ from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.panels.edits import EditPanel
 from objectgs.objectgs_addon.picking import selection
 from objectgs.objectgs_addon.process.jobs import Job, State
-from objectgs.objectgs_addon.running import background
+from objectgs.objectgs_addon.running import background, results
 from objectgs.objectgs_addon.scene import capture, carrier, kinds
 from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
@@ -1415,6 +1415,25 @@ def test_hole_of_moved_object_is_filled(ground, root):
     assert surface(root) == filled
     bpy.ops.objectgs.reset_object(what="TRANSFORM")
     assert surface(root) == captured and not entry(root).fill
+
+
+def test_fills_arrive_where_splats_were_captured(ground, root):
+    """Also before the splats get back what was applied to them."""
+    blender_scene.show_kinds(root, "splats")
+    edit_objects(ground / "objects.json", {1: {"removed": True, "fill": True}})
+    results.show_fill(root)
+    obj, filled = part(root, "splats", 2), surface(root)
+    before = seen([None, obj])
+    edit_objects(ground / "objects.json", {1: {"removed": None, "fill": None}})
+    results.show_fill(root)
+    choose(obj)
+    bpy.ops.object.origin_set(type="ORIGIN_CURSOR")
+    assert obj.location.length > 1.0
+    edit_objects(ground / "objects.json", {1: {"removed": True, "fill": True}})
+    results.show_fill(root)
+    assert stay([None, obj], before) and obj.location.length < 1e-5
+    positions = [np.frombuffer(each["position"], np.float32) for each in (filled, surface(root))]
+    assert positions[1] == pytest.approx(positions[0], abs=1e-5)
 
 
 def test_waiting_fill_says_for_what(ground, root, monkeypatch):

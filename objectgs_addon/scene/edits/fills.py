@@ -23,6 +23,7 @@ from ..object_display import Objects
 from ..shading.modifiers import update_groups
 from ..shading.node_groups import COVERED, HIDDEN
 from ..splats import positions_of, splat_attributes
+from .placement import take_back
 from .single_splats import deleted_splats
 
 SHOWN_FILL = "objectgs_fill"
@@ -71,6 +72,7 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
             changes.append((collection, obj, np.zeros_like(fills), own, shows))
     carrier.require_object_mode(obj for _, obj, *_ in changes)
     for collection, obj, fills, own, shows in changes:
+        take_back(obj.data)  # Splats that are filled anew no longer tell what was applied to them.
         _keep(obj, fills)
         if shows:
             pivot = part_of(collection, OBJECT_PARENT)
