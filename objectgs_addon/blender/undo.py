@@ -20,7 +20,7 @@ def push(title: str) -> None:
 
 @contextmanager
 def step_for_links(title: str) -> Iterator[None]:
-    """Push an undo step if objects are meanwhile moved, or collections and objects created, removed or linked elsewhere.
+    """Push an undo step if objects are moved meanwhile, or collections and objects created, removed or linked.
 
     Undo keeps data-blocks that are equal in both of its steps as they are in memory. Without a step of its own, such a
     change would leave them with pointers to data-blocks that undo frees, and Blender would crash; or a transform would

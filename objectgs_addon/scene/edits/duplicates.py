@@ -155,7 +155,7 @@ def _follow(source: Any, copy: Any) -> None:
 
 
 def _move_beside(twin: bpy.types.Object, obj: bpy.types.Object, source: Any, copy: Any) -> None:
-    """Move the twin of a part that has lost its pivot to where the part is relative to the splats, or else the pivot."""
+    """Move the twin of a part without its pivot to where that is relative to the splats, or else to the pivot."""
     pairs = ((part_of(source, kind), part_of(copy, kind)) for kind in (SPLATS, OBJECT_PARENT))
     for base, other in pairs:
         if base is not None and other is not None:
