@@ -3,7 +3,8 @@
 
 from .camera_path import make_path, new_camera
 from .compositing import set_up_compositor, show_frames
-from .shot import ignored_settings, rendered_twice, shot_of
+from .limits import ignored_settings, rendered_twice
+from .shot import shot_of
 
 __all__ = [
     "ignored_settings",

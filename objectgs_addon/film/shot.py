@@ -11,29 +11,26 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
 from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.objects import is_singular
 from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
-from ..scene import scene_meshes
 from ..scene.capture import origin_of
-from ..scene.kinds import MESH, OBJECT_PARENT, PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
+from ..scene.kinds import parent_of
 from ..scene.object_collection import center_of
+from .instances import SplatsInstance, evaluated_pivots, instances_of, layer_paths, world_of
 
 TOLERANCE = 2e-6
 """Tolerance, relative to the scene size, up to which an object counts as not moved, since Blender stores float32."""
 
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-_MOST_NAMES = 5
 _UNSUPPORTED = {"ORTHO": "orthographic", "PANO": "panoramic"}
 
 
@@ -70,12 +67,12 @@ def shot_of(
         raise InputError("The scene's frame range is empty; set its start and end.")
     if frames[0] < 0:
         raise InputError("The first frame is below 0, but image sequences have no negative numbers; move the shot.")
-    instances = _instances_of(scene, root, _paths(view_layer, root))
+    instances = instances_of(scene, root, layer_paths(view_layer, root))
     before = scene.frame_current, scene.frame_subframe
     has_markers = any(marker.camera is not None for marker in scene.timeline_markers)
     made, scale, places = [], None, _Places()
     try:
-        with _evaluated_pivots(view_layer, instances):
+        with evaluated_pivots(view_layer, instances):
             for done, number in enumerate(frames, 1):
                 if camera is None and has_markers:
                     # A camera that begins during the exposure begins with the next frame, as in Blender.
@@ -97,52 +94,6 @@ def shot_of(
     return Shot(width, height, made, pixel_aspect=aspect, depth_scale=scale, only_named=True)
 
 
-def ignored_settings(scene: bpy.types.Scene, camera: bpy.types.Object | None = None) -> str | None:
-    """Return a sentence about settings of Blender's renders that film frames do not have; None if there are none.
-
-    camera: as for `shot_of`.
-    """
-    render = scene.render
-    cameras = [camera] if camera else [scene.camera, *(marker.camera for marker in scene.timeline_markers)]
-    blurred = {each.name for each in cameras if each is not None and each.type == "CAMERA" and each.data.dof.use_dof}
-    found = [f"the depth of field of {name}" for name in sorted(blurred)]
-    if render.use_border and render.use_crop_to_border:
-        found.append("Crop to Render Region")
-    if render.use_multiview:
-        found.append("Stereoscopy")
-    if _has_holdouts(scene):
-        found.append("Holdout")
-    words = [", ".join(found[:-1]), *found[-1:]]
-    return f"Film frames of splats are rendered without {' and '.join(filter(None, words))}." if found else None
-
-
-def rendered_twice(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> str | None:
-    """Return a sentence about what renders show of a hidden reconstruction beside its film frames; None for nothing.
-
-    Instances and collections outside the reconstruction's are not hidden with it.
-    """
-    names = {
-        (instance.instancer or instance.pivot).name
-        for instance in _instances_of(scene, root, _paths(view_layer))
-        if instance.is_seen() and not (instance.instancer and _contains(instance.instancer.instance_collection, root))
-    }
-    if not names:
-        return None
-    some = ", ".join(sorted(names)[:_MOST_NAMES]) + (", ..." if len(names) > _MOST_NAMES else "")
-    return f"Renders show these twice, since they are outside the collection {root.name}: {some}; move them into it."
-
-
-def _has_holdouts(scene: bpy.types.Scene) -> bool:
-    layers = (path[-1] for view_layer in scene.view_layers for paths in _paths(view_layer).values() for path in paths)
-    return any(obj.is_holdout and not obj.hide_render for obj in scene.objects) or any(
-        layer.holdout and not layer.exclude for layer in layers
-    )
-
-
-def _contains(collection: bpy.types.Collection, other: bpy.types.Collection) -> bool:
-    return other == collection or other in collection.children_recursive
-
-
 @dataclass(frozen=True)
 class _RootTransform:
     """Similarity transform of a reconstruction, without nonuniform scale or shear of its parent empty.
@@ -158,7 +109,7 @@ class _RootTransform:
     @classmethod
     def of(cls, root: bpy.types.Collection, scale: float | None) -> _RootTransform:
         """Return the transform at the current frame; `scale` is fixed per shot for depth, None uses the parent's."""
-        world = np.array(_world_of(parent_of(root)), np.float64)
+        world = np.array(world_of(parent_of(root)), np.float64)
         left, stretches, right = np.linalg.svd(world[:3, :3])
         if stretches[2] <= 1e-12 * stretches[0]:
             raise InputError(f"{root.name} is scaled to zero by its parent; set a scale other than zero.")
@@ -199,59 +150,6 @@ class _RootTransform:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class _SplatsInstance:
-    """A splat carrier in the scene, or an instance of it.
-
-    Attributes:
-        object_id: ID of its object.
-        splats: the carrier.
-        pivot: empty at the origin of its vertices.
-        parts: the carrier and the meshes of the same object; at least one must be shown.
-        paths: paths of layer collections from the top of the view layer; at least one path must be shown.
-        instancer: empty that instances the carrier's collection, or None.
-    """
-
-    object_id: int
-    splats: bpy.types.Object
-    pivot: bpy.types.Object
-    parts: tuple
-    paths: tuple
-    instancer: bpy.types.Object | None = None
-
-    def can_move(self) -> bool:
-        """Return whether it may have another place in other frames than those of a shot."""
-        chain: list[bpy.types.Object] = []
-        for obj in (self.splats, self.instancer):
-            while obj is not None and kind_of(obj) != PARENT:
-                chain.append(obj)
-                obj = obj.parent
-        return any(each.animation_data or each.constraints or each.rigid_body for each in chain)
-
-    def is_seen(self) -> bool:
-        """Return whether Blender renders it at the current frame, ignoring the reconstruction's own collection."""
-        top = self.instancer or self.pivot
-        shown = any(not part.hide_render and part.visible_camera for part in self.parts)
-        return (
-            shown
-            and not top.hide_render
-            and top.visible_camera
-            and any(all(map(_is_shown, path)) for path in self.paths)
-        )
-
-    def world(self) -> np.ndarray:
-        """Return the map from local to world coordinates at the current frame, (4, 4) float64."""
-        world = _world_of(self.splats)
-        if self.instancer is not None:
-            offset = Matrix.Translation(-self.instancer.instance_collection.instance_offset)
-            world = _world_of(self.instancer) @ offset @ world
-        return np.array(world, np.float64)
-
-
-def _is_shown(layer: bpy.types.LayerCollection) -> bool:
-    return not (layer.exclude or layer.indirect_only or layer.collection.hide_render)
-
-
 class _Places:
     """Transforms of objects in capture coordinates, computed again only for those that have moved since the last time.
 
@@ -259,9 +157,9 @@ class _Places:
     """
 
     def __init__(self) -> None:
-        self._known: dict[_SplatsInstance, tuple[bytes, np.ndarray | None]] = {}
+        self._known: dict[SplatsInstance, tuple[bytes, np.ndarray | None]] = {}
 
-    def place(self, instance: _SplatsInstance, transform: _RootTransform) -> np.ndarray | None:
+    def place(self, instance: SplatsInstance, transform: _RootTransform) -> np.ndarray | None:
         """Return an object's (4, 4) transform at the current frame; None if it has no volume."""
         world = instance.world()
         key = world.tobytes() + transform.key
@@ -271,7 +169,7 @@ class _Places:
         return self._known[instance][1]
 
 
-def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstance]) -> None:
+def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[SplatsInstance]) -> None:
     """Remove the transforms of objects that are not moved in any sample, and have no duplicates, even hidden ones.
 
     They keep their transforms of objects.json, which are those of the current frame, so objects that can move do not.
@@ -288,114 +186,6 @@ def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[_SplatsInstanc
     for sample in samples:
         for object_id in sample.objects.keys() - moving:
             sample.objects[object_id] = Placed()
-
-
-def _instances_of(
-    scene: bpy.types.Scene, root: bpy.types.Collection, paths: dict[bpy.types.Collection, list]
-) -> list[_SplatsInstance]:
-    """Return the splat carriers of a reconstruction, and their instances; paths: those of `_paths`."""
-    parent, members = parent_of(root), {root, *root.children_recursive}
-
-    def is_ours(obj: bpy.types.Object) -> bool:
-        if kind_of(obj) != SPLATS:
-            return False
-        above = obj
-        while above is not None and kind_of(above) != PARENT:
-            above = above.parent
-        # An object that the user has parented to others has none of the parents.
-        return above == parent if above is not None else not members.isdisjoint(obj.users_collection)
-
-    ours = [obj for obj in scene.objects if is_ours(obj)]
-    whole = tuple(scene_meshes(root))
-    found = [instance for obj in ours if (instance := _instance_of(obj, paths, whole)) is not None]
-    for instancer in scene.objects:
-        if instancer.instance_type == "COLLECTION" and instancer.instance_collection is not None:
-            for obj in instancer.instance_collection.all_objects:
-                if is_ours(obj):
-                    found.append(_instance_of(obj, paths, whole, instancer))
-    return [instance for instance in found if instance is not None]
-
-
-def _instance_of(obj: bpy.types.Object, paths: Any, whole: tuple, instancer: Any = None) -> _SplatsInstance | None:
-    """Return a splat carrier as an instance, None if it belongs to no object; whole: the meshes of the whole scene."""
-    collections, object_id = list(obj.users_collection), object_id_of(obj)
-
-    def is_own(above: bpy.types.Object | None) -> bool:
-        # The user may have parented a part to the pivot of another object.
-        return kind_of(above) == OBJECT_PARENT and object_id_of(above) == object_id
-
-    pivot = (
-        obj.parent
-        if is_own(obj.parent)
-        else next(
-            (pivot for collection in collections if (pivot := part_of(collection, OBJECT_PARENT)) is not None), None
-        )
-    )
-    if pivot is None or object_id is None:
-        return None
-    # The user may have given a mesh another parent, or moved it to another collection.
-    apart = [part for each in collections for part in each.objects if not is_own(part.parent)]
-    meshes = [part for part in {*pivot.children, *apart} if kind_of(part) == MESH and object_id_of(part) == object_id]
-    if object_id == 0:
-        meshes += whole
-    top = instancer or obj
-    of_top = [path for collection in top.users_collection for path in paths.get(collection, ())]
-    return _SplatsInstance(object_id, obj, pivot, (obj, *meshes), tuple(of_top), instancer)
-
-
-def _paths(view_layer: bpy.types.ViewLayer, without: bpy.types.Collection | None = None) -> dict:
-    """Map collections to their paths in a view layer: lists of layer collections from the top, without one of them."""
-    found: dict = {}
-
-    def walk(layer: Any, path: list) -> None:
-        if layer.collection != without:
-            path = [*path, layer]
-        found.setdefault(layer.collection, []).append(path)
-        for child in layer.children:
-            walk(child, path)
-
-    walk(view_layer.layer_collection, [])
-    return found
-
-
-def _world_of(obj: bpy.types.Object) -> Matrix:
-    """Return an object's world matrix, computed from its parent's if hidden, since Blender may skip hidden objects."""
-    if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT" or obj.constraints:
-        return obj.matrix_world
-    return _world_of(obj.parent) @ obj.matrix_parent_inverse @ obj.matrix_basis
-
-
-@contextmanager
-def _evaluated_pivots(view_layer: bpy.types.ViewLayer, instances: Any) -> Iterator[None]:
-    """Temporarily show animated pivots in viewports, since Blender does not animate hidden objects."""
-    inactive = {
-        instance.pivot: instance
-        for instance in instances
-        if (instance.pivot.animation_data or instance.pivot.constraints) and not instance.pivot.visible_get()
-    }
-    changed = []
-
-    def show(obj: bpy.types.Object) -> None:
-        changed.append((obj, obj.hide_viewport))
-        obj.hide_viewport = False
-
-    hidden = []
-    for pivot, instance in inactive.items():
-        for path in instance.paths:
-            for layer in path:
-                show(layer)
-                show(layer.collection)
-        show(pivot)
-        if pivot.hide_get(view_layer=view_layer):
-            hidden.append(pivot)
-            pivot.hide_set(False, view_layer=view_layer)
-    try:
-        yield
-    finally:
-        for pivot in hidden:
-            pivot.hide_set(True, view_layer=view_layer)
-        for obj, before in reversed(changed):
-            obj.hide_viewport = before
 
 
 def _sample(
@@ -420,7 +210,7 @@ def _sample(
         raise InputError(
             f"{camera.name} is {kind}, but splats can be rendered through perspective cameras only; choose one."
         )
-    matrix = np.array(_world_of(camera), np.float64)
+    matrix = np.array(world_of(camera), np.float64)
     left, _, right = np.linalg.svd(matrix[:3, :3])
     matrix[:3, :3] = left @ right
     if np.linalg.det(matrix[:3, :3]) < 0:
