@@ -409,7 +409,7 @@ def test_killed_process_leaves_no_thread(tmp_path):
     process = BackendProcess([sys.executable, "-c", "import time; time.sleep(60)"], tmp_path)
     process.send(1_000_000 * "x")
     process.kill()
-    until(lambda: threading.active_count() == before)
+    until(lambda: threading.active_count() <= before)
     assert process.send("stop") is False
 
 
