@@ -220,7 +220,8 @@ def test_edit_export_and_import_commands(trained, backend_python, tmp_path, monk
     assert ran.returncode == 0, ran.output + ran.errors
     shown = {obj.name for obj in opened(tmp_path / "again" / "objectgs.blend") if obj.get("objectgs_kind") == "splats"}
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    assert f"object {second['id']} splats" in shown and f"object {first['id']} splats" not in shown
+    # The file tells the names, too.
+    assert f"{second['name']} splats" in shown and f"{first['name']} splats" not in shown
     assert "no object nobody" in error_report("edit", "made", "--remove", "nobody")
     assert "not a PLY" in error_report("import-splats", "made/objects.json", "--out", "third")
     assert not (tmp_path / "third").exists()
