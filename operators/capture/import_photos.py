@@ -8,7 +8,8 @@ import bpy
 from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringProperty
 
 from ...backend.shared.errors import InputError
-from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource, has_poses, has_poses_of
+from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource, has_poses
+from ...backend.shared.photos.source_files import has_poses_of
 from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background, results

@@ -30,6 +30,7 @@ from backend.sfm.sources.photos import Photo
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.formats import photos_source
+from backend.shared.photos import source_files
 
 from .command_result import assert_rejected
 from .rendered_photos import HEIGHT, VIEWS, WIDTH, photo, pose, pose_errors, ring, write_photos
@@ -61,7 +62,7 @@ def test_poses_are_those_of_the_photos(made, photos):
     assert report["points"] > 300 and report["reprojection_error"] < 0.6
     degrees, positions = pose_errors(made, ring())
     assert len(degrees) == VIEWS and np.median(degrees) < 0.3 and np.median(positions) < 0.01
-    assert report["files"] and photos_source.has_poses_of(made, photos_source.PhotosSource([photos]))
+    assert report["files"] and source_files.has_poses_of(made, photos_source.PhotosSource([photos]))
     assert (made / "masks" / "photo 1.png").exists() and (made / "labels.json").exists()
     for path in (photos / "images").iterdir():
         assert (made / "images" / path.name).read_bytes() == path.read_bytes()

@@ -11,7 +11,8 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 import objectgs as extension
-from objectgs.backend.shared.formats.photos_source import PhotosSource, digest_of_files, has_poses_of, write_source
+from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
+from objectgs.backend.shared.photos.source_files import digest_of_files, has_poses_of
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_record
 from objectgs.objectgs_addon.blender import messages
@@ -168,7 +169,9 @@ def test_only_changes_of_photos_count(submitted, computed, tmp_path):
     wanted = PhotosSource([folder])
     earlier = (folder / "b.jpg").stat().st_mtime_ns - 10**12
     (folder / "earlier" / "sfm").mkdir(parents=True)
-    for name in (".DS_Store", "._b.jpg", "b.xmp", "earlier/sfm/source.json", "earlier/1.jpg"):
+    (folder / "splats" / "meshes").mkdir(parents=True)
+    results = ("earlier/sfm/source.json", "earlier/1.jpg", "splats/objectgs.json", "splats/meshes/mug.png")
+    for name in (".DS_Store", "._b.jpg", "b.xmp", "labels.json", *results):
         (folder / name).write_bytes(b"")
     (folder / "notes.txt").write_bytes(b"more")
     (folder / "b.jpg").chmod(0o600)
@@ -184,6 +187,28 @@ def test_only_changes_of_photos_count(submitted, computed, tmp_path):
     assert not has_poses_of(computed, wanted)
     (computed / "sfm" / "sfm.json").write_text("{}")
     assert has_poses_of(computed, wanted), "as of an earlier version"
+    later = (computed / "sfm" / "sfm.json").stat().st_mtime_ns + 10**9
+    os.utime(folder / "notes.txt", ns=(later, later))
+    assert has_poses_of(computed, wanted)
+    (folder / "c.jpg").write_bytes(b"")
+    os.utime(folder / "c.jpg", ns=(later, later))
+    assert not has_poses_of(computed, wanted), "as of an earlier version, with a new photo"
+
+
+@pytest.mark.parametrize("place", ["images", "masks"])
+@pytest.mark.parametrize("name", ["labels.json", "test.txt"])
+def test_lists_count_where_they_are_copied(submitted, computed, tmp_path, place, name):
+    """They lie beside a folder of photos or of masks; those of a capture are its own."""
+    folder = tmp_path / "trip"
+    (folder / place).mkdir()
+    (folder / place / "b.jpg").write_bytes(b"")
+    wanted = PhotosSource([folder])
+    before, own = digest_of_files(wanted, computed), digest_of_files(wanted, folder)
+    for other in ("notes.json", f"{place}/{name}"):
+        (folder / other).write_text("{}")
+    assert digest_of_files(wanted, computed) == before
+    (folder / name).write_text("{}")
+    assert digest_of_files(wanted, computed) != before and digest_of_files(wanted, folder) == own
 
 
 def test_messages_about_earlier_poses_go_with_new_ones(submitted, computed, monkeypatch):

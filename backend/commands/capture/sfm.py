@@ -40,10 +40,10 @@ from ...shared.formats.photos_source import (
     VIDEOS,
     WORK,
     PhotosSource,
-    digest_of_files,
     read_source,
     write_source,
 )
+from ...shared.photos.source_files import digest_of_files
 from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
 from ...shared.stopping import StoppingReporter

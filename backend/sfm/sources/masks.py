@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,11 +18,9 @@ from ...shared.errors import InputError
 from ...shared.events import Reporter
 from ...shared.formats.atomic import atomic_path, make_folder, write_atomic
 from ...shared.formats.file_names import legible
-from ...shared.formats.photos_source import WORK
+from ...shared.formats.photos_source import LISTS, WORK
 from .. import database
 from .stamps import IMAGES, MASKS, Stamps
-
-_OTHER_FILES = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
 
 
 def write_masks(
@@ -55,7 +52,7 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
         if masks.files[photo].relative_to(folder).as_posix() not in mask_names(names[photo])[0]
         and names[photo] != photo
     }
-    others = [path for path in source.iterdir() if path.is_file() and _OTHER_FILES.fullmatch(path.name)]
+    others = [path for path in source.iterdir() if path.is_file() and LISTS.fullmatch(path.name)]
     for path in [*others, *(path for path in (folder.rglob("*") if folder.is_dir() else ()) if path.is_file())]:
         if path.suffix.lower() in LOSSY_SUFFIXES or legible(str(path)) != str(path):
             continue

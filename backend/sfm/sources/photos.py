@@ -15,8 +15,8 @@ from ...capture.mask_sources import MaskFiles
 from ...shared.errors import InputError
 from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
-from ...shared.formats.photos_source import NOT_OF_USERS, PHOTOS, SOURCE, VIDEOS, WORK, natural_order
-from ...shared.reconstruction.folder import Reconstruction
+from ...shared.formats.photos_source import NOT_OF_USERS, PHOTOS, VIDEOS, WORK, natural_order
+from ...shared.photos.source_files import folders_of_results
 from ...shared.stopping import StoppingReporter
 from .. import database
 from . import photo_files, video
@@ -280,9 +280,7 @@ def _listed(base: Path, masks: Path, capture: Path) -> list[Path]:
     try:
         inside = capture.resolve()
         paths = list(base.rglob("*"))
-        made = {path.parent for path in paths if path.name == Reconstruction(base).settings.name}
-        made |= {path.parents[1] for path in paths if path.parts[-2:] == (WORK, SOURCE)}
-        left_out = {masks, *(folder for folder in made if base in folder.parents)}
+        left_out = {masks, *folders_of_results(paths, base)}
         return _without_doubles(
             path
             for path in paths

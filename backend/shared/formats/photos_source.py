@@ -5,11 +5,10 @@ These are stored in its sfm/source.json and sfm/sfm.json.
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,8 +36,8 @@ PHOTOS = IMAGES | HEIC | RAW
 NOT_OF_USERS = (".", "@eaDir", "#recycle")
 """How names of files and folders begin that computers put beside photos, such as thumbnails."""
 VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
-_COUNTED = PHOTOS | VIDEOS | {".npy", ".npz"}
-"""Photos, videos and masks."""
+LISTS = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
+"""Names of files with names of objects or of held-out photos, which may be beside the folders of photos and of masks."""
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
@@ -115,68 +114,6 @@ def read_source(capture: Path) -> PhotosSource | None:
 def has_poses(capture: Path) -> bool:
     """Return whether the poses of a capture were computed from photos alone."""
     return is_file(capture / WORK / REPORT) and is_folder(capture / SPARSE)
-
-
-def has_poses_of(capture: Path, wanted: PhotosSource) -> bool:
-    """Return whether a capture has poses that were computed as wanted, of the same files.
-
-    Photos to leave out, the set and the networks may be others.
-    """
-    stored = read_source(capture)
-    if stored is None or not has_poses(capture):
-        return False
-    features = stored.features if wanted.features == "auto" else wanted.features
-    own = replace(wanted, features=features, leave_out=stored.leave_out, set=stored.set, matcher=stored.matcher)
-    if own != stored:
-        return False
-    try:
-        known = read_json(capture / WORK / REPORT).get("files")
-    except (InputError, AttributeError):
-        return False
-    return known is None or known == digest_of_files(wanted, capture)
-
-
-def digest_of_files(source: PhotosSource, capture: Path) -> str | None:
-    """Return a hash of the names, sizes and times of the files that poses are computed from; None if some are gone.
-
-    Args:
-        source: the photos and videos, whose folder may have masks and captures in it.
-        capture: the capture that is made of them; it may be their folder, of which only images/ counts then.
-    """
-    lenses = source.calibration
-    try:
-        tops = [(top, [top] if top.is_file() else _files_of(top, capture)) for top in source.photos]
-        if lenses is not None:
-            tops.append((lenses, [lenses] if lenses.is_file() else sorted(lenses.glob("cameras.*"))))
-        found = [
-            (path.relative_to(top).as_posix(), status.st_size, status.st_mtime_ns)
-            for top, paths in tops
-            for path in paths
-            for status in (path.stat(),)
-        ]
-    except OSError:
-        return None
-    return hashlib.sha256(repr(found).encode()).hexdigest()[:16] if all(paths for _, paths in tops) else None
-
-
-def _files_of(top: Path, capture: Path) -> list[Path]:
-    """Return the photos, videos and masks in a folder, but for those in captures there."""
-    paths = list(top.rglob("*"))
-    made = {path.parents[1] for path in paths if path.parts[-2:] == (WORK, SOURCE)} - {top}
-    is_own = top.resolve() == capture.resolve()
-    folders = ("images",) if is_own else ("images", "masks") if (top / "images").is_dir() else None
-
-    def counts(path: Path) -> bool:
-        parts = path.relative_to(top).parts
-        return (
-            path.suffix.lower() in _COUNTED
-            and not any(part.startswith(NOT_OF_USERS) for part in parts)
-            and (folders is None or parts[0] in folders)
-            and made.isdisjoint(path.parents)
-            and path.is_file()
-        )
-
-    return sorted(path for path in paths if counts(path))
 
 
 class PhotoError(NamedTuple):

@@ -1,0 +1,1 @@
+"""The files of photos, videos and masks that captures are made of."""
