@@ -556,6 +556,20 @@ def test_objects_keep_the_names_that_the_masks_do_not_say(photos, tmp_path, run_
     assert json.loads((photos / "labels-given.json").read_text()) == {"1": "mug", "9": "spoon"}
 
 
+@pytest.mark.parametrize("objects", ["given", "find"])
+def test_names_beside_given_masks_are_those_of_their_ids(objects, write_capture, run_command):
+    """Later names of labels.json are those of the same IDs only where these were kept."""
+    folder = write_capture(views=6, points=200).folder
+    labels = folder / "labels.json"
+    labels.write_text('{"1": "spoon", "9": "fork"}')
+    assert run_command("masks", folder, folder / "masks", "--objects", objects).code == EXIT_DONE
+    assert (folder / "masks-given" / "labels.json").exists() == (objects == "find")
+    assert (folder / "labels-given.json").exists() == (objects == "given")
+    labels.write_text('{"1": "mug"}')
+    assert run_command("masks", folder, folder / "masks-given", "--objects", "given").code == EXIT_DONE
+    assert listed(folder)[1] == ("mug" if objects == "given" else "spoon")
+
+
 def test_names_of_other_ids_are_not_taken(photos, tmp_path, run_command):
     (photos / "labels.json").write_text('{"1": "spoon", "2": "fork"}')
     path = write_cvat_video(tmp_path)

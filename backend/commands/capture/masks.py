@@ -406,7 +406,9 @@ def _write(
         sheet.save(folder / OVERVIEW, quality=88)
         write_json(folder / RECORD, record)
     if not was_made:
-        _keep_labels(labels, kept_masks(capture) / labels.name if is_kept else capture / _GIVEN_LABELS, found)
+        # Beside the given masks, the names are those of their IDs, also where labels.json has later ones.
+        has_other_ids = is_kept and record["found"]
+        _keep_labels(labels, kept_masks(capture) / labels.name if has_other_ids else capture / _GIVEN_LABELS, found)
     write_json(labels, {str(i): name for i, name in found.names.items()})
 
 
