@@ -18,7 +18,7 @@ from ..shared.errors import InputError
 from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json
 
-_VERSION = 3
+_VERSION = 2
 """Number to be raised with changes of what is found in a photo, so that kept results are not used any more."""
 
 _TURN = Image.Transpose
@@ -125,7 +125,9 @@ class PhotoSegments:
         return Segments(renumbered, [None] * len(found), [names[number - 1] for number in found])
 
     def _path(self, name: str) -> Path:
-        return self._kept / f"{name}.npz"
+        # Earlier versions have kept segments of photos as they are stored, also of those that are not upright.
+        turned = "" if _turns(self._images / name)[0] is None else ".upright"
+        return self._kept / f"{name}{turned}.npz"
 
     def _is_kept(self, name: str) -> bool:
         path = self._path(name)
