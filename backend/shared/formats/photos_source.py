@@ -37,7 +37,7 @@ NOT_OF_USERS = (".", "@eaDir", "#recycle")
 """How names of files and folders begin that computers put beside photos, such as thumbnails."""
 VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".m2ts", ".mpg", ".mpeg", ".wmv", ".3gp"}
 LISTS = re.compile(r"(labels?|classes|names|test)[\w.-]*\.(json|txt|csv)", re.IGNORECASE)
-"""Names of files with names of objects or of held-out photos, which may be beside the folders of photos and of masks."""
+"""Files with names of objects or of held-out photos, which may be beside the folders of photos and of masks."""
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
