@@ -342,14 +342,28 @@ def test_photos_of_label_studio_have_other_names(tmp_path, name, reference):
     assert source.photos == [name] and len(source.read(name).objects) == 2
 
 
-def test_photos_in_the_folder_of_the_masks_are_no_masks(tmp_path):
-    """The masks have a word that the photos lack."""
+def noise():
+    """A picture."""
+    return Image.fromarray(np.random.default_rng(0).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8))
+
+
+def in_colors(mask):
+    """A mask whose IDs are encoded as colors."""
+    colors = np.array([[0, 0, 0], *([n, 0, 0] for n in range(1, 256))], np.uint8)
+    return Image.fromarray(colors[mask])
+
+
+@pytest.mark.parametrize("with_word", [True, False])
+@pytest.mark.parametrize("encoded", [Image.fromarray, in_colors])
+def test_pictures_in_the_folder_of_the_masks_are_no_masks(with_word, encoded, tmp_path):
+    """The masks have a word that copies of the photos lack, or pictures of the masks have one."""
+    mask, picture = ("photo {}_mask.png", "photo {}.png") if with_word else ("photo {}.png", "photo {}_seg.png")
     for folder in ("images", "given"):
         (tmp_path / folder).mkdir()
-        for n in (0, 1):
-            Image.effect_noise(SIZE, 50).convert("RGB").save(tmp_path / folder / f"photo {n}.png")
     for n in (0, 1):
-        Image.fromarray(masks_of(n)).save(tmp_path / "given" / f"photo {n}_mask.png")
+        noise().save(tmp_path / "images" / f"photo {n}.png")
+        noise().save(tmp_path / "given" / picture.format(n))
+        encoded(masks_of(n)).save(tmp_path / "given" / mask.format(n))
     source = open_source(tmp_path / "given", tmp_path, [f"photo {n}.png" for n in (0, 1)])
     for n in (0, 1):
         assert (source.read(f"photo {n}.png").numbers == masks_of(n)).all()

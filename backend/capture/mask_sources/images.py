@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -25,6 +25,9 @@ from .segments import Segments, Shape, draw_shapes
 _GRAY = 0.02
 """Largest fraction of pixels that are neither black nor white in a JPEG that is black and white."""
 
+_MOST_COLORS = 256
+"""Largest number of colors of a file that is taken for a mask rather than for a picture, where both are there."""
+
 
 class MaskFiles:
     """A file for each photo with its object IDs, or in black and white with one object.
@@ -41,9 +44,15 @@ class MaskFiles:
         self.files = with_words
         if folder.resolve() != photos.resolve():
             found = _found(files, names, beside=False)
-            # Where most photos have both, those without a word for masks are copies of the photos.
-            both = sum(path != found[name] for name, path in with_words.items())
-            self.files = with_words if 2 * both > len(found) else found
+            both = [name for name, path in with_words.items() if path != found[name]]
+            # Where most photos have both, those without a word for masks may be copies of the photos, but those with
+            # one may also be pictures of the masks.
+            are_copies = (
+                2 * len(both) > len(found)
+                and _holds_for_most(is_three_channel, [found[name] for name in both])
+                and not _holds_for_most(_is_picture, [with_words[name] for name in both])
+            )
+            self.files = with_words if are_copies else found
         self.photos: Sequence[str] = sorted(self.files)
         self.lossy = [name for name in self.photos if self.files[name].suffix.lower() in LOSSY_SUFFIXES]
         self.what = "ID masks"
@@ -83,6 +92,15 @@ def _found(files: Files, names: Collection[str], beside: bool) -> dict[str, Path
         if (path := files.first(accepted) or files.first(lossy)) is not None:
             there[name] = path
     return there
+
+
+def _holds_for_most(condition: Callable[[Path], bool], paths: Sequence[Path]) -> bool:
+    return 2 * sum(map(condition, paths)) > len(paths)
+
+
+def _is_picture(path: Path) -> bool:
+    """Return whether a file has more colors than a mask whose IDs are encoded as colors."""
+    return is_three_channel(path) and read_image(path).getcolors(_MOST_COLORS) is None
 
 
 def _is_white(ids: np.ndarray) -> bool:
