@@ -272,6 +272,9 @@ def test_description_is_that_of_the_comments(tmp_path):
     path = minimal(tmp_path / "b.ply", {})
     path.write_bytes(path.read_bytes().replace(b"made elsewhere", "\ncomment ".join(odd).encode()))
     assert read_description(path) == Description() and len(read_splats(path)[0]) == 1
+    path = minimal(tmp_path / "c.ply", {})
+    path.write_bytes(path.read_bytes().replace(b"made elsewhere", b'object 1 "a\\ud83d"'))
+    assert read_description(path).names == {1: "a?"}, "half a surrogate pair cannot be written again"
 
 
 def test_unknown_properties_are_ignored_and_doubles_kept(tmp_path):

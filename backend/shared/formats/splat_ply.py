@@ -20,6 +20,7 @@ import numpy as np
 from ..class_table import LARGEST_ID
 from ..errors import InputError
 from ..splats.blending import EPS_2D, LEAST_EPS_2D, USUAL_EPS_2D
+from .json_file import parse_json
 from .ply import read_comments, read_vertices
 
 MEANS = ("x", "y", "z")
@@ -109,7 +110,7 @@ def read_description(path: Path) -> Description:
             elif word == _NAME:
                 number, _, text = rest.partition(" ")
                 if text.startswith('"'):
-                    names[int(number)] = json.loads(text)
+                    names[int(number)] = parse_json(text)
         except ValueError:
             continue
     background = background and np.clip(background, 0.0, 1.0).tolist()
