@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import shutil
 import struct
 from dataclasses import replace
 from itertools import pairwise
@@ -506,6 +507,11 @@ def test_import_assigns_ids_from_masks(run_command, write_capture, tmp_path):
     assert made.splats.read_bytes() == before and not made.checkpoint.exists()
     assert run_command(*training, "--restart").code == EXIT_DONE and made.splats.read_bytes() != before
     assert run_command(*training).code == EXIT_DONE
+    importing = ("import-splats", tmp_path / "foreign.ply", "--out", made.folder)
+    assert_rejected(run_command(*importing), "already contains a training")
+    shutil.rmtree(made.checkpoint)
+    assert run_command(*importing, "--capture", scene.folder).code == EXIT_DONE
+    assert_rejected(run_command(*training), "was imported from", "foreign.ply", "--restart")
 
 
 def test_import_without_masks_keeps_ids_of_file(run_command, write_capture, folder, tmp_path):

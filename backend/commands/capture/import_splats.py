@@ -74,7 +74,9 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
             reporter.warning(sentence)
         objects = write_objects_of(folder, splats, names)
         export = description.background and ExportRecord(len(splats), 0, background=description.background)
-        update_record(folder, imported=ImportRecord(str(options.splats.resolve()), len(splats)), export=export)
+        imported = ImportRecord(str(options.splats.resolve()), len(splats))
+        # The checkpoint of an earlier training is gone.
+        update_record(folder, imported=imported, export=export, training=None)
     reporter.done(splats=len(splats), objects=objects, reconstruction=str(folder.folder))
 
 
