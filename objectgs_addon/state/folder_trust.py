@@ -51,7 +51,8 @@ def offered(root: bpy.types.Collection) -> Path:
 def moved_folder(root: bpy.types.Collection) -> Path | None:
     """Return the reconstruction folder that was moved or copied together with the .blend, or None.
 
-    Only the surroundings of the .blend are searched, which Blender has just read.
+    Only the surroundings of the .blend are searched, which Blender has just read. Where its relative path leads to the
+    stored folder, neither was moved, and what is found elsewhere is another reconstruction.
     """
     if not bpy.data.filepath or root.library is not None:
         return None
@@ -59,7 +60,9 @@ def moved_folder(root: bpy.types.Collection) -> Path | None:
     paths = [relative, stored[2:] if isinstance(stored, str) and stored.startswith("//") else None, "."]
     for path in paths:
         folder = _beside_blend(path) if isinstance(path, str) else None
-        if folder is not None and folder != scene.folder_of(root) and Reconstruction(folder).cameras.is_file():
+        if folder is not None and folder == scene.folder_of(root):
+            return None
+        if folder is not None and Reconstruction(folder).cameras.is_file():
             return folder
     return None
 

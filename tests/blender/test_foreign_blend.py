@@ -321,6 +321,15 @@ def test_a_relative_path_leads_only_to_the_surroundings(root, folder, path):
     assert folder_trust.moved_folder(root) is None
 
 
+def test_a_file_in_the_folder_of_another_reconstruction_keeps_its_own(extension, folder, known, tmp_path):
+    """As where the reconstruction that the file was built of has been removed from it."""
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    other = write_folder(folder.parent / "other")
+    opened(save(other / "objectgs.blend", known))
+    assert scene.folder_of(active()) == folder
+    assert folder_trust.moved_folder(active()) is None and folder_trust.offered(active()) == folder
+
+
 def test_a_path_relative_to_the_blend_is_accepted_by_one_click(root, folder):
     del root[kinds.RELATIVE_FOLDER]
     root[kinds.FOLDER] = "//../rec"
