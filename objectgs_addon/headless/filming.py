@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from ..state import folder_trust
 from . import apart
 from .built import digest_of
 from .commands import absolute, find_backend, run_backend, save_blend
-from .picture import choose_camera, choose_engine, open_blend, write_picture
+from .picture import choose_camera, choose_engine, may_run_scripts, open_blend, write_picture
 
 COMPOSITES = "composite.json"
 """File beside the composites with what they were made of, apart from the splats."""
@@ -36,6 +37,7 @@ def film(options: argparse.Namespace) -> None:
     find_backend(options.backend_python)
     blend, out = absolute(options.blend), absolute(options.out)
     target = open_blend(blend, reporter)
+    opened = digest_of(blend)
     if options.size is not None:
         target.render.resolution_x, target.render.resolution_y = options.size
         target.render.resolution_percentage = 100
@@ -82,11 +84,13 @@ def film(options: argparse.Namespace) -> None:
         ):
             if problem is not None:
                 reporter.warning(problem)
+    is_replaced = False
     if options.save:
         save_blend(absolute(options.save), reporter)
+        is_replaced = absolute(options.save).samefile(blend)
     if options.composite:
         choose_engine(target, options.engine, options.samples, reporter)
-        since = _settled(out, {"blend": digest_of(blend), **_choices(options)})
+        since = _settled(out, opened, digest_of(blend) if is_replaced else opened, _choices(options))
         missing = [number for number in frames if not _is_composed(out, number, options.composite, since)]
         if len(missing) < len(frames):
             reporter.status(f"{len(frames) - len(missing)} of {len(frames)} composites exist already.")
@@ -102,20 +106,35 @@ def film(options: argparse.Namespace) -> None:
 def _choices(options: argparse.Namespace) -> dict[str, Any]:
     """Return the options that composites depend on, as JSON holds them."""
     size = list(options.size) if options.size else None
-    return {"camera": options.camera, "engine": options.engine, "samples": options.samples, "size": size}
+    return {
+        "camera": options.camera,
+        "engine": options.engine,
+        "samples": options.samples,
+        "size": size,
+        "scripts": may_run_scripts(),
+    }
 
 
-def _settled(out: Path, settings: dict[str, Any]) -> int:
+def _settled(out: Path, opened: str, saved: str, choices: dict[str, Any]) -> int:
     """Return the time (ns) since which the composites in `out` were to have these settings, and store them there.
 
     Where they are those of an earlier command, also of another computer, it is the time of that.
+
+    Args:
+        out: folder of the composites.
+        opened: digest of the .blend as it was opened.
+        saved: digest of it with its compositor set up, if that replaces it; each time it is saved, it is another.
+        choices: options that composites depend on.
     """
     path = out / COMPOSITES
-    known = None
+    known, settings = None, {"blend": saved, **choices}
     with contextlib.suppress(InputError):
         known = read_json(path)
+    since = path.stat().st_mtime_ns if known == {"blend": opened, **choices} else None
     if known != settings:
         write_json(path, settings)
+        if since is not None:
+            os.utime(path, ns=(since, since))
     return path.stat().st_mtime_ns
 
 

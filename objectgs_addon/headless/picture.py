@@ -82,11 +82,9 @@ def open_blend(blend: Path, reporter: Reporter) -> bpy.types.Scene:
 
     Its scripts and Python drivers run only with Blender's option -y; without it, a warning tells that there are some.
     """
-    words = sys.argv[: sys.argv.index("--")] if "--" in sys.argv else []
-    may_run = not {"-y", "--enable-autoexec"}.isdisjoint(words)
     try:
         with quiet():
-            bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=may_run)
+            bpy.ops.wm.open_mainfile(filepath=str(blend), load_ui=False, use_scripts=may_run_scripts())
     except RuntimeError as error:
         raise InputError(f"{blend} cannot be opened as a .blend file.") from error
     if bpy.app.autoexec_fail:
@@ -95,6 +93,12 @@ def open_blend(blend: Path, reporter: Reporter) -> bpy.types.Scene:
             "if you trust the file, give Blender the option -y before -P."
         )
     return bpy.context.scene
+
+
+def may_run_scripts() -> bool:
+    """Return whether Blender was given the option that lets scripts and Python drivers of a .blend run."""
+    words = sys.argv[: sys.argv.index("--")] if "--" in sys.argv else []
+    return not {"-y", "--enable-autoexec"}.isdisjoint(words)
 
 
 def choose_camera(scene: bpy.types.Scene, name: str | None, blend: Path) -> None:

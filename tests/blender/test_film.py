@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -808,6 +809,12 @@ def test_film_command_renders_only_missing_composites(shot_blend, noting_backend
     later(out / "splats.0002.exr", 100)
     assert composed() == ["0002"]
     later(out / "splats.0002.exr", -100)
+    assert composed("--samples", "3") == ["0001", "0002"] and composed("--samples", "3") == []
+    before = Path(blend).read_bytes()
+    for _ in range(2):
+        assert composed("--samples", "3", "--save", str(blend)) == []
+    assert Path(blend).read_bytes() != before
+    monkeypatch.setattr(sys, "argv", ["blender", "-b", "-y", "-P", "headless.py", "--", "film"])
     assert composed("--samples", "3") == ["0001", "0002"] and composed("--samples", "3") == []
     bpy.ops.wm.open_mainfile(filepath=str(blend))
     bpy.data.objects["before"].location.x += 1
