@@ -27,9 +27,9 @@ _BATCH = """\
 Run every capture in FOLDER (each subfolder with images/ or sparse/), each into
 DIR/<name>, and write a summary to DIR/batch.md and DIR/batch.json. A failure does
 not stop the other captures. The same command continues later; captures that were
-finished with the same settings are skipped, and so are those that another process
+finished with the same settings are skipped, and so are those that another batch
 runs, so several computers can share the folders. Exit code 2 if any capture cannot
-be used, 1 if any failed for another reason.
+be used, also since another program uses it, 1 if any failed for another reason.
 """
 
 _TRAIN_OPTIONS = """\
@@ -215,7 +215,7 @@ def _parser() -> argparse.ArgumentParser:
         "source",
         type=Path,
         metavar="DIR_OR_BLEND",
-        help="reconstruction folder with its objectgs.blend, or any .blend file",
+        help="reconstruction folder, whose .blend that was built last is rendered, or any .blend file",
     )
     render.add_argument("--out", type=Path, required=True, metavar="IMAGE", help="file.png, .jpg or .exr")
     render.add_argument("--camera", metavar="NAME", help="a camera of the file (the scene's own)")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 import traceback
 from contextlib import AbstractContextManager
@@ -55,7 +56,7 @@ def batch(options: argparse.Namespace) -> None:
         "meshes": not options.no_meshes,
     }
     Reconstruction(out).create()
-    summary = _Summary(out, captures)
+    summary, in_use = _Summary(out, captures), 0
     for number, capture in enumerate(captures, 1):
         entry = summary.entry(legible(capture.name))
         title = f"{entry['name']} ({number} of {len(captures)})"
@@ -67,15 +68,24 @@ def batch(options: argparse.Namespace) -> None:
             summary.update(entry)
             options.reporter.status(f"== {title}: {entry['error']}")
             continue
-        if _is_done(entry, wanted, out / capture.name):
-            options.reporter.status(f"== {title}: already done.")
-            continue
-        options.reporter.status(f"== {title}")
-        _run_one(capture, out / capture.name, entry, wanted, summary, options)
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(locked(out, f".{capture.name}.run.lock"))
+            except FolderInUse:
+                options.reporter.status(f"== {title}: left to another batch, which runs it.")
+                continue
+            # Another batch may have finished it by now.
+            entry = summary.entry(entry["name"])
+            if _is_done(entry, wanted, out / capture.name):
+                options.reporter.status(f"== {title}: already done.")
+                continue
+            options.reporter.status(f"== {title}")
+            _run_one(capture, out / capture.name, entry, wanted, summary, options)
+            in_use += entry["state"] == UNFINISHED
     summary.read()
     options.reporter.status(f"{summary.sentence()} See {out / 'batch.md'}.")
-    if summary.count(BAD_INPUT):
-        raise InputError(f"{summary.count(BAD_INPUT)} of {len(captures)} captures cannot be used.")
+    if unusable := summary.count(BAD_INPUT) + in_use:
+        raise InputError(f"{unusable} of {len(captures)} captures cannot be used.")
     if summary.count(FAILED):
         raise StepFailed(f"{summary.count(FAILED)} of {len(captures)} captures failed.")
 
@@ -121,11 +131,14 @@ def _run_one(
     summary: _Summary,
     options: argparse.Namespace,
 ) -> None:
-    """Run one capture; its entry in the summary stays valid even if the process is killed."""
+    """Run one capture; its entry in the summary stays valid even if the process is killed.
+
+    The entry stays unfinished if another program uses the folder.
+    """
     earlier = entry["seconds"] if entry["state"] == UNFINISHED and entry["settings"] == wanted else 0.0
     entry.update(_NOTHING, settings=wanted, seconds=earlier)
     summary.update(entry)
-    started, is_elsewhere = time.monotonic(), False
+    started = time.monotonic()
     try:
         reconstruct(capture, folder, options)
         report = read_report(folder)
@@ -141,9 +154,7 @@ def _run_one(
         entry["error"] = "Cancelled; the same command continues from there."
         raise
     except FolderInUse as error:
-        # The other process writes the entry, and may have done so by now.
-        is_elsewhere = True
-        options.reporter.warning(f"{capture.name} is left to another process: {error}")
+        entry["error"] = str(error)
     except InputError as error:
         entry.update(state=BAD_INPUT, error=str(error))
     except OSError as error:
@@ -155,8 +166,7 @@ def _run_one(
         entry.update(state=FAILED, error=f"{type(error).__name__}: {' '.join(str(error).split())}")
     finally:
         entry["seconds"] = round(earlier + time.monotonic() - started, 1)
-        if not is_elsewhere:
-            summary.update(entry)
+        summary.update(entry)
     if entry["error"]:
         options.reporter.status(f"{capture.name}: {entry['error']}")
 

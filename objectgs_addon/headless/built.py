@@ -17,11 +17,18 @@ BLEND = "objectgs.blend"
 
 def blend_to_write(folder: Path, reporter: Reporter) -> Path:
     """Return DIR/objectgs.blend or, where that is not as it was built, one with the next number that is."""
-    first, built = folder / BLEND, _built(folder)
-    numbered = (first if i == 1 else first.with_stem(f"{first.stem}-{i}") for i in itertools.count(1))
-    blend = next(path for path in numbered if not path.exists() or built.get(path.name) == digest_of(path))
+    first, blend = folder / BLEND, _numbered(folder)[-1]
     if blend != first:
         reporter.warning(f"{first} may hold your own changes and is kept; {blend.name} is written instead.")
+    return blend
+
+
+def blend_to_render(folder: Path, reporter: Reporter) -> Path:
+    """Return the .blend of a folder that was built last, or DIR/objectgs.blend if there is none."""
+    first = folder / BLEND
+    blend = next((path for path in reversed(_numbered(folder)) if path.exists()), first)
+    if blend != first:
+        reporter.status(f"Rendering {blend}, which was built after {first.name} was saved.")
     return blend
 
 
@@ -34,6 +41,16 @@ def digest_of(path: Path) -> str:
     """Return a hash of a file's content."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Return DIR/objectgs.blend, -2 and so on, up to the first that is missing or as it was built."""
+    first, built, paths = folder / BLEND, _built(folder), []
+    for number in itertools.count(1):
+        paths.append(first if number == 1 else first.with_stem(f"{first.stem}-{number}"))
+        if not paths[-1].exists() or built.get(paths[-1].name) == digest_of(paths[-1]):
+            break
+    return paths
 
 
 def _built(folder: Path) -> dict[str, str]:

@@ -26,7 +26,7 @@ from ..process.blocking import run_blocking
 from ..state import folder_trust
 from ..state import viewports as view
 from . import apart
-from .built import BLEND, blend_to_write, remember_built
+from .built import blend_to_render, blend_to_write, remember_built
 from .picture import render_picture
 
 PICTURE = "render.png"
@@ -127,7 +127,7 @@ def build(options: argparse.Namespace) -> None:
 def render(options: argparse.Namespace) -> None:
     """Render an image of a .blend."""
     source = absolute(options.source)
-    blend = source / BLEND if source.is_dir() else source
+    blend = blend_to_render(source, options.reporter) if source.is_dir() else source
     if not blend.is_file():
         raise InputError(f"{blend} does not exist; make it with the build command.")
     if options.apart and options.camera:

@@ -22,7 +22,8 @@ bpy = pytest.importorskip("bpy")
 from objectgs.backend.cli.parser import build_parser
 from objectgs.backend.shared.console import ConsoleReporter
 from objectgs.backend.shared.formats.ply import read_vertices
-from objectgs.objectgs_addon.headless import COMMANDS
+from objectgs.backend.shared.reconstruction.lock import locked
+from objectgs.objectgs_addon.headless import COMMANDS, commands
 from objectgs.objectgs_addon.headless.batch import fingerprint
 from objectgs.objectgs_addon.headless.picture import open_blend
 
@@ -138,7 +139,7 @@ def test_build_contains_reconstruction(blend, trained):
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
-def test_build_keeps_a_file_that_was_saved_since(tmp_path, capsys):
+def test_build_keeps_a_file_that_was_saved_since(tmp_path, monkeypatch, capsys):
     write_cameras(tmp_path, [look_at((0, -1, 10.0))])
     write_points(tmp_path, np.random.default_rng(0).normal(size=(9, 3)), np.ones(9, int))
     write_objects(tmp_path, {1: "mug"})
@@ -152,6 +153,16 @@ def test_build_keeps_a_file_that_was_saved_since(tmp_path, capsys):
         assert headless.main(["build", str(tmp_path)]) == 0
         assert "kept; objectgs-2.blend is written instead." in capsys.readouterr().err
     assert first.read_bytes() == saved and second.exists() and not (tmp_path / "objectgs-3.blend").exists()
+    rendered = []
+    monkeypatch.setattr(commands, "render_picture", lambda _reporter, blend, *_: rendered.append(blend))
+    words = ["render", str(tmp_path), "--out", str(tmp_path / "a.png")]
+    assert headless.main(words) == 0 and rendered == [second]
+    assert f"Rendering {second}" in capsys.readouterr().out
+    second.write_bytes(b"saved, too")
+    assert headless.main(words) == 0 and rendered == [second, second]
+    second.unlink()
+    assert headless.main(words) == 0 and rendered == [second, second, first]
+    assert "Rendering" not in capsys.readouterr().out.splitlines()[-1]
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
@@ -602,7 +613,7 @@ def test_batch_goes_on_after_a_name_that_is_no_text(capture, tmp_path, monkeypat
 
 
 def test_batches_of_two_computers_leave_captures_to_each_other(capture, tmp_path, monkeypatch, capsys):
-    """The other one finishes "b" while this one runs "a", and runs "c"."""
+    """The other one finishes "b" while this one runs "a", and runs "c", between two commands of the backend."""
     captures, out = tmp_path / "captures", tmp_path / "out"
     for name in ("a", "b", "c"):
         shutil.copytree(capture, captures / name)
@@ -617,14 +628,33 @@ def test_batches_of_two_computers_leave_captures_to_each_other(capture, tmp_path
         (out / "b" / name).touch()
     entries["a"] |= {"state": "unfinished", "error": None}
     entries["b"] |= {"state": "done", "error": None, "psnr": 30.0}
+    entries["c"] |= {"state": "unfinished", "error": None}
     other.write_text(json.dumps({"captures": list(entries.values())}))
     capsys.readouterr()
 
-    assert headless.main([*words, answering(tmp_path, when=swap, field=', "in_use": true')]) == 0
+    with locked(out, ".c.run.lock"):
+        assert headless.main([*words, answering(tmp_path, when=swap)]) == 2
+        captured = capsys.readouterr()
+        assert "b (2 of 3): already done." in captured.out and "1 done, 1 bad input, 1 unfinished." in captured.out
+        assert "c (3 of 3): left to another batch, which runs it." in captured.out
+        assert summary(out)["b"] == entries["b"] and summary(out)["c"] == entries["c"]
+        with locked(out, ".a.run.lock"):
+            entries["a"] |= {"state": "unfinished", "error": None}
+            (out / "batch.json").write_text(json.dumps({"captures": list(entries.values())}))
+            assert headless.main([*words, answering(tmp_path)]) == 0
+    assert not list(out.glob(".*.lock"))
+
+
+def test_batch_tells_of_captures_that_another_program_uses(capture, tmp_path, monkeypatch, capsys):
+    """As where Blender trains one; no other batch is going to finish it."""
+    captures, out = tmp_path / "captures", tmp_path / "out"
+    shutil.copytree(capture, captures / "one")
+    monkeypatch.setenv("OBJECTGS_PYTHON", "")
+    python = answering(tmp_path, field=', "in_use": true')
+    assert headless.main(["batch", str(captures), "--out", str(out), "--backend-python", python]) == 2
     captured = capsys.readouterr()
-    assert "b (2 of 3): already done." in captured.out and "1 done, 2 unfinished." in captured.out
-    assert "c is left to another process: Reached." in captured.err
-    assert summary(out)["b"] == entries["b"] and summary(out)["c"]["error"] is None
+    assert "one: Reached." in captured.out and "1 of 1 captures cannot be used." in captured.err
+    assert summary(out)["one"]["state"] == "unfinished" and summary(out)["one"]["error"] == "Reached."
 
 
 @pytest.mark.parametrize(
