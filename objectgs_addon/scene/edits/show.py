@@ -36,7 +36,8 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     """Apply removals, recoloring, placements and duplicates from objects.json.
 
     Objects that the user has moved since keep their placement, unless the placement in objects.json has changed. Copies
-    made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step.
+    made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step; only there
+    do duplicates follow their originals, whose parts the user may have moved to other collections.
 
     Args:
         root: the reconstruction's collection.
@@ -56,7 +57,7 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     show_fills(root, objects)
     if is_free:
         adopt_blender_duplicates(root)
-    bring_up_to_date(root)
+        bring_up_to_date(root)
     copies = duplicates_of(root)
     for object_id, collection in collections.items():
         entry = objects.entries.get(object_id)
