@@ -45,8 +45,9 @@ def _undone(*_: Any) -> None:
     """Update the folder's edits and the fills after undo or redo."""
     for root in _accepted_roots():
         store = partial(object_edits.store, before=_before.pop(root.session_uid, object_list.State({}, {})))
+        show_fill = partial(results.show_fill, has_step=False)
         fill_holes = partial(background.fill_holes, again=False)
-        for action in (store, splat_edits.follow, results.show_fill, fill_holes, pointing.refresh):
+        for action in (store, splat_edits.follow, show_fill, fill_holes, pointing.refresh):
             _try(action, root)
 
 

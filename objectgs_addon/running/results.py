@@ -154,9 +154,9 @@ def _show_fill_job(job: Job, _owner: bpy.types.Scene | None) -> bool:
     return False
 
 
-def show_fill(root: bpy.types.Collection) -> None:
-    """Show the fills that objects.json requires."""
-    scene.show_fills(root, scene.Objects.read(scene.folder_of(root)))
+def show_fill(root: bpy.types.Collection, has_step: bool = True) -> None:
+    """Show the fills that objects.json requires; `has_step` as for `scene.show_fills`."""
+    scene.show_fills(root, scene.Objects.read(scene.folder_of(root)), has_step)
 
 
 def _announce_hidden(job: Job) -> bool:

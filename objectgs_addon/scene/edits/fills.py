@@ -40,11 +40,17 @@ def missing_fill(root: bpy.types.Collection, objects: Objects) -> Path | None:
     return None if path is None or path.is_file() else path
 
 
-def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
+def show_fills(root: bpy.types.Collection, objects: Objects, has_step: bool = True) -> None:
     """Show the fills that the edits require.
 
     While the file for these edits is missing, objects that still require a fill keep the splats shown so far, also if
     the carriers have been filled anew.
+
+    Args:
+        root: the reconstruction's collection.
+        objects: the objects with the user's edits.
+        has_step: whether the change is part of an undo step. After an undo it is not, and carriers are left as they
+            are that Blender's operators have changed: only a step keeps their vertices and transforms together.
 
     Raises:
         InputError: A file cannot be read, or a carrier is in Edit Mode; nothing is changed.
@@ -70,6 +76,8 @@ def show_fills(root: bpy.types.Collection, objects: Objects) -> None:
         shows = path.name if len(own.new) else ""
         if shows != (obj.data.get(SHOWN_FILL, "") if fills.any() else ""):
             changes.append((collection, obj, np.zeros_like(fills), own, shows))
+    if not has_step:
+        changes = [change for change in changes if np.array_equal(carrier.applied_map(change[1].data), np.eye(4))]
     carrier.require_object_mode(obj for _, obj, *_ in changes)
     for collection, obj, fills, own, shows in changes:
         take_back(obj.data)  # Splats that are filled anew no longer tell what was applied to them.
