@@ -190,11 +190,22 @@ def _redraw_when_built() -> float | None:
 @bpy.app.handlers.persistent
 @writing.allowed
 def _changed(scene: bpy.types.Scene, _depsgraph: Any) -> None:
-    """Switch off the preview of new splats."""
-    if _is_drawn(scene.objectgs) and is_in_file():
+    """Switch off the preview of new splats, or show it if drawing them has failed."""
+    if scene.objectgs.draw_splats and is_in_file():
         undrawn = _undrawn()
         for part in gather.carriers(scene):
             show_preview(part, part in undrawn)
+
+
+@bpy.app.handlers.persistent
+@writing.allowed
+def _file_loaded(*_: Any) -> None:
+    """Try again what another file had no memory for; a driver that cannot draw splats has made no renderer."""
+    global _failure
+    if _renderer is not None:
+        _failure = None
+    if _failure is not None and is_in_file():
+        _show_previews()
 
 
 def register() -> None:
@@ -202,11 +213,13 @@ def register() -> None:
     if not bpy.app.background:
         _handler = bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_VIEW")
         bpy.app.handlers.depsgraph_update_post.append(_changed)
+        bpy.app.handlers.load_post.append(_file_loaded)
 
 
 def unregister() -> None:
     global _handler, _renderer
     if _handler is not None:
+        bpy.app.handlers.load_post.remove(_file_loaded)
         bpy.app.handlers.depsgraph_update_post.remove(_changed)
         bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
         _handler = None

@@ -169,6 +169,23 @@ def test_drawing_that_fails_is_not_tried_in_each_redraw(root, registered, monkey
     assert len(tried) == 2
 
 
+def test_drawing_that_failed_is_tried_again_in_another_file(root, registered, monkeypatch):
+    """Until then, new splats are shown by their previews, too."""
+    bpy.context.scene.objectgs.draw_splats = True
+    preview = preview_of(part(root, 1))
+    monkeypatch.setattr(viewport, "_failure", "no memory")
+    monkeypatch.setattr(viewport, "_renderer", None)
+    viewport._changed(bpy.context.scene, None)
+    assert preview.show_viewport
+    preview.show_viewport = False
+    viewport._file_loaded()
+    assert viewport.failure() == "no memory" and preview.show_viewport, "the driver stays the same"
+    monkeypatch.setattr(viewport, "_renderer", SimpleNamespace(free=lambda: None))
+    viewport._file_loaded()
+    viewport._changed(bpy.context.scene, None)
+    assert viewport.failure() is None and not preview.show_viewport
+
+
 @pytest.mark.parametrize("orthographic", [False, True])
 def test_splats_are_sorted_back_to_front(orthographic):
     depths = np.random.default_rng(0).uniform(-1.0, 50.0, 20_000).astype(np.float32)
