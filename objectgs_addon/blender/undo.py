@@ -9,6 +9,10 @@ from typing import Any
 
 import bpy
 
+from .older_files import KIND
+
+_is_left_to_blender = False
+
 
 def push(title: str) -> None:
     """Push an undo step; without a window, scripts push their own."""
@@ -19,13 +23,30 @@ def push(title: str) -> None:
 
 
 @contextmanager
+def left_to_blender() -> Iterator[None]:
+    """Push no steps for links meanwhile, in an edit of a property that Blender pushes a step for afterward.
+
+    A step in between would hold the property's new value already, so that undoing the edit would not restore it.
+    """
+    global _is_left_to_blender
+    before, _is_left_to_blender = _is_left_to_blender, True
+    try:
+        yield
+    finally:
+        _is_left_to_blender = before
+
+
+@contextmanager
 def step_for_links(title: str) -> Iterator[None]:
-    """Push an undo step if objects are moved meanwhile, or collections and objects created, removed or linked.
+    """Push an undo step if the add-on's objects are moved, created, removed or linked meanwhile, or its collections.
 
     Undo keeps data-blocks that are equal in both of its steps as they are in memory. Without a step of its own, such a
     change would leave them with pointers to data-blocks that undo frees, and Blender would crash; or a transform would
     be undone without the change of its mesh.
     """
+    if _is_left_to_blender:
+        yield
+        return
     before = _links()
     try:
         yield
@@ -35,16 +56,18 @@ def step_for_links(title: str) -> Iterator[None]:
 
 
 def _links() -> list[Any]:
-    """Return what all collections of the file contain, since the user may have moved those of a reconstruction."""
-    return [
-        (
-            _uid(collection),
-            [_uid(child) for child in collection.children],
-            [(_uid(obj), _uid(obj.parent), _uid(obj.data), obj.matrix_basis.copy()) for obj in collection.objects],
-        )
-        for collection in (*bpy.data.collections, *(scene.collection for scene in bpy.data.scenes))
-        if collection.library is None
-    ]
+    """Return what the file's collections contain of the add-on, since the user may have moved it to any of them."""
+    found = []
+    for collection in (*bpy.data.collections, *(scene.collection for scene in bpy.data.scenes)):
+        if collection.library is not None:
+            continue
+        children = [_uid(child) for child in collection.children if KIND in child]
+        # Scenes of the user's may have tens of thousands of other objects.
+        parts = [obj for obj in collection.objects if KIND in obj]
+        if children or parts or KIND in collection:
+            places = [(_uid(obj), _uid(obj.parent), _uid(obj.data), obj.matrix_basis.copy()) for obj in parts]
+            found.append((_uid(collection), children, places))
+    return found
 
 
 def _uid(block: bpy.types.ID | None) -> int | None:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """User edits: the list of objects is filled from objects.json, and changes are written back to it.
 
-While the user has not accepted the folder (`folder_trust`), changes of rows stay in the list. `accept` writes those
-that differ from the row's `stored` state.
+Until the folder is accepted (`folder_trust`), changes of rows stay in the list. `accept` writes what was not `stored`.
 """
 
 from __future__ import annotations
@@ -372,6 +371,7 @@ def _flush_later() -> None:
     flush()
 
 
+@undo.left_to_blender()
 def _row_changed(item: Any, **changes: Any) -> None:
     """Store an edit of a row, or revert it on failure, since update callbacks must not raise."""
     if _filling:

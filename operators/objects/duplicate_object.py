@@ -27,6 +27,7 @@ class DuplicateObject(bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
+        object_edits.store_edits(root)  # Earlier changes have an undo step of their own, without the duplicates.
         known = {scene.from_stored(item.object_id) for item in root.objectgs.objects}
         wanted = selection.selected_collections(context, root) or [
             scene.object_collections(root)[object_id] for object_id in object_list.chosen_ids(context, root)

@@ -10,6 +10,7 @@ from ...objectgs_addon.blender import messages
 from ...objectgs_addon.picking import selection
 from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
+from ..common.reporting import reports_errors
 
 
 class RemoveObject(bpy.types.Operator):
@@ -33,16 +34,17 @@ class RemoveObject(bpy.types.Operator):
     def poll(cls, context: bpy.types.Context) -> bool:
         return need.not_removed(cls, context, " already")
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
+    @reports_errors
+    def execute(self, context: bpy.types.Context) -> None:
         root = need.active_root(context)
+        object_edits.store_edits(root)  # Earlier changes have an undo step of their own.
         selected = selection.selected_collections(context, root)
         duplicates = [collection for collection in selected if scene.kind_of(collection) == "object_copy"]
         ids = [scene.object_id_of(collection) for collection in selected if collection not in duplicates]
         ids = ids if selected else object_list.chosen_ids(context, root)
         ids = [object_id for object_id in ids if object_list.item_of(root, object_id)]
         if not ids and not duplicates:
-            self.report({"ERROR"}, "The background cannot be removed; hide it, or choose an object")
-            return {"CANCELLED"}
+            raise InputError("The background cannot be removed; hide it, or choose an object")
         try:
             for duplicate in duplicates:
                 scene.remove_duplicate(duplicate)
@@ -51,10 +53,9 @@ class RemoveObject(bpy.types.Operator):
             if ids:
                 object_edits.remove(root, ids, self.floaters, self.fill)
         except (InputError, OSError) as error:
-            self.report({"ERROR"}, messages.sentence(error))
-            # Deleted duplicates need an undo step.
-            return {"FINISHED"} if duplicates else {"CANCELLED"}
-        return {"FINISHED"}
+            if not duplicates:
+                raise
+            self.report({"ERROR"}, messages.sentence(error))  # Deleted duplicates need an undo step.
 
 
 CLASSES = (RemoveObject,)

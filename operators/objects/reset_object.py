@@ -43,6 +43,7 @@ class ResetObject(bpy.types.Operator):
         if self.what == "COLORS":
             object_edits.reset_colors(root, [object_id])
         else:
+            object_edits.store_edits(root)  # Earlier changes have an undo step of their own.
             scene.reset_placement(root, scene.object_collections(root)[object_id])
             object_edits.store_edits(root)
             if item.fill and not item.removed:

@@ -1130,6 +1130,87 @@ def test_written_colors_have_an_undo_step_only_with_new_duplicates(root, steps):
     assert steps == ["Colors"] and len(blender_scene.duplicates_of(active())[1]) == 1
 
 
+def test_edits_of_rows_are_undone_with_what_they_store(root, steps):
+    """A step in the middle of an edit would have the new name already."""
+    bpy.ops.ed.undo_push(message="begin")
+    duplicate_in_blender()
+    name = item(active()).name
+    item(active()).name = "cup"
+    bpy.ops.ed.undo_push(message="named")
+    assert steps == [] and len(blender_scene.duplicates_of(active())[1]) == len(entry(active()).copies) == 1
+    bpy.ops.ed.undo()
+    assert item(active()).name == entry(active()).name == name
+
+
+@pytest.mark.parametrize("change", ["duplicate", "remove", "reset"])
+def test_operators_store_earlier_changes_in_an_undo_step_of_their_own(root, steps, change):
+    activate(root, 1)
+    bpy.ops.ed.undo_push(message="begin")
+    if change == "remove":
+        bpy.ops.objectgs.duplicate_object()
+        copy = blender_scene.duplicates_of(active())[1][0]
+    duplicate_in_blender()
+    if change == "remove":
+        selection.select_collections(bpy.context, [copy])
+    part(active(), "object_parent").location.x += 1.0
+    bpy.ops.ed.undo_push(message="moved")
+    moved = seen([None, part(active(), "splats")])
+    count = len(blender_scene.duplicates_of(active()).get(1, ()))
+    if change == "duplicate":
+        bpy.ops.objectgs.duplicate_object()
+    elif change == "remove":
+        bpy.ops.objectgs.remove_object()
+    else:
+        bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    bpy.ops.ed.undo_push(message="operator")
+    assert steps == ["Transforms and Duplicates"]
+    bpy.ops.ed.undo()
+    assert len(blender_scene.duplicates_of(active())[1]) == len(entry(active()).copies) == count + 1
+    assert stay([None, part(active(), "splats")], moved) and entry(active()).transform is not None
+
+
+def test_remove_deletes_selected_duplicates_of_blender_alone(root):
+    before = links()
+    selection.select_object(bpy.context, root, 1)
+    bpy.ops.object.duplicate()
+    bpy.ops.objectgs.remove_object()
+    assert links() == before and not entry(root).removed and entry(root).copies == ()
+
+
+def test_undo_steps_look_only_at_what_is_of_the_extension(root):
+    """Scenes may have tens of thousands of other objects."""
+    before = undo._links()
+    props = bpy.data.collections.new("Props")
+    bpy.context.scene.collection.children.link(props)
+    props.objects.link(bpy.data.objects.new("prop", None))
+    assert undo._links() == before
+    props.objects.link(part(root, "splats"))
+    assert undo._links() != before
+
+
+def test_duplicates_keep_their_parts_in_edit_mode(root):
+    """Parts of the original may be in other collections then, until they can be recovered with an undo step."""
+    blender_scene.show_kinds(root, "both")
+    activate(root, 1)
+    bpy.ops.objectgs.duplicate_object()
+    (copy,) = blender_scene.duplicates_of(root)[1]
+    there, splats, props = len(copy.objects), part(root, "splats"), bpy.data.collections.new("Props")
+    bpy.context.scene.collection.children.link(props)
+    props.objects.link(splats)
+    collection_of(root).objects.unlink(splats)
+    holder = bpy.data.objects.new("holder", bpy.data.meshes.new("holder"))
+    bpy.context.scene.collection.objects.link(holder)
+    selection.select_nothing(bpy.context)
+    bpy.context.view_layer.objects.active = holder
+    bpy.ops.object.mode_set(mode="EDIT")
+    activate(root, 2)
+    bpy.ops.objectgs.remove_object()
+    assert len(copy.objects) == there and kinds.part_of(copy, "splats") is not None
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bpy.ops.objectgs.restore_object(object="2")
+    assert len(copy.objects) == there and part(root, "splats") == splats
+
+
 def test_edits_survive_merge_and_split(root):
     part(root, "object_parent").location.x += 1.0
     item(root).hue = 0.1
@@ -1434,6 +1515,21 @@ def test_fills_arrive_where_splats_were_captured(ground, root):
     assert stay([None, obj], before) and obj.location.length < 1e-5
     positions = [np.frombuffer(each["position"], np.float32) for each in (filled, surface(root))]
     assert positions[1] == pytest.approx(positions[0], abs=1e-5)
+
+
+def test_fills_shown_after_undo_leave_applied_transforms(ground, root):
+    """No undo step would keep the vertices and the transform together; the next edit shows the fill."""
+    blender_scene.show_kinds(root, "splats")
+    obj = part(root, "splats", 2)
+    choose(obj)
+    bpy.ops.object.origin_set(type="ORIGIN_CURSOR")
+    before, place = surface(root), obj.location.copy()
+    edit_objects(ground / "objects.json", {1: {"removed": True, "fill": True}})
+    results.show_fill(root, has_step=False)
+    assert surface(root) == before and obj.location == place
+    object_edits.fill(root)
+    item(root, 2).name = "floor"
+    assert surface(root) != before and obj.location.length < 1e-5
 
 
 def test_waiting_fill_says_for_what(ground, root, monkeypatch):
