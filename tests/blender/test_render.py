@@ -10,7 +10,7 @@ from objectgs.backend.shared.splats.spherical_harmonics import C0
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.meshes import export
-from objectgs.objectgs_addon.scene.shading import materials
+from objectgs.objectgs_addon.scene.shading import materials, render_settings
 from objectgs.objectgs_addon.state import viewports
 
 import headless
@@ -221,6 +221,23 @@ def test_moved_instances_of_splats_are_named(shown):
     assert problem.startswith("second is an instance")
     instance.hide_render = True
     assert not blender_scene.scene_problems(scene, shown)
+
+
+def test_objects_are_looked_through_only_if_splats_are_instanced(fresh, folder):
+    """The panel asks in each redraw, also of a scene with tens of thousands of instances of other things."""
+    extension = headless.extension()
+    extension.register()
+    try:
+        bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+        tree = bpy.data.collections.new("tree")
+        instance = bpy.data.objects.new("instance", None)
+        instance.instance_type, instance.instance_collection = "COLLECTION", tree
+        bpy.context.scene.collection.objects.link(instance)
+        assert render_settings._used_with_splats() == set()
+        root = instance.instance_collection = bpy.context.scene.objectgs.active
+        assert render_settings._used_with_splats() == {root}
+    finally:
+        extension.unregister()
 
 
 @pytest.mark.skipif(bpy.app.version < (5, 0), reason="older versions render in one space")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import bpy
@@ -170,15 +171,21 @@ def _moved_instance(scene: bpy.types.Scene) -> bpy.types.Object | None:
 
     Modifiers, which turn splats to the camera, run at the place of the original.
     """
-    have_splats: dict[bpy.types.Collection, bool] = {}
-    for obj in scene.objects:
+    instanced = _used_with_splats()
+    for obj in scene.objects if instanced else ():  # Panels ask in each redraw, also of a scene with many objects.
         collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
-        if collection is None or obj.hide_render:
-            continue
-        if collection not in have_splats:
-            have_splats[collection] = any(kind_of(part) == SPLATS for part in collection.all_objects)
-        if have_splats[collection]:
+        if collection in instanced and not obj.hide_render:
             moved = obj.matrix_world @ Matrix.Translation(-collection.instance_offset) - Matrix.Identity(4)
             if max(abs(value) for row in moved for value in row) > SAME_PLACE:
                 return obj
     return None
+
+
+def _used_with_splats() -> set[bpy.types.Collection]:
+    """Return the collections with splats that have other users, as instances are, than what links or activates them."""
+    above = (*bpy.data.collections, *(scene.collection for scene in bpy.data.scenes))
+    links = Counter(child for collection in above for child in collection.children)
+    settings = (getattr(scene, "objectgs", None) for scene in bpy.data.scenes)  # None if nothing is registered
+    links.update(each.active for each in settings if each is not None and each.active is not None)
+    used = [collection for collection in bpy.data.collections if collection.users > links[collection]]
+    return {collection for collection in used if any(kind_of(part) == SPLATS for part in collection.all_objects)}
