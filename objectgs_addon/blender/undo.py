@@ -62,7 +62,7 @@ def _links() -> list[Any]:
         if collection.library is not None:
             continue
         children = [_uid(child) for child in collection.children if KIND in child]
-        # Scenes of the user's may have tens of thousands of other objects.
+        # The user's scenes may have tens of thousands of other objects.
         parts = [obj for obj in collection.objects if KIND in obj]
         if children or parts or KIND in collection:
             places = [(_uid(obj), _uid(obj.parent), _uid(obj.data), obj.matrix_basis.copy()) for obj in parts]

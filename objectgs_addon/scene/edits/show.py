@@ -36,8 +36,8 @@ def show_edits(root: bpy.types.Collection, objects: Objects) -> None:
     """Apply removals, recoloring, placements and duplicates from objects.json.
 
     Objects that the user has moved since keep their placement, unless the placement in objects.json has changed. Copies
-    made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step; only there
-    do duplicates follow their originals, whose parts the user may have moved to other collections.
+    made with Blender's own operators are converted to duplicates in Object Mode, where they get an undo step. Only
+    there do duplicates follow their originals, since parts that the user moved elsewhere are recovered first.
 
     Args:
         root: the reconstruction's collection.
