@@ -425,7 +425,7 @@ def test_segments_are_drawn_small_over_large(tmp_path):
     assert found.numbers[20, 5] == 1 and found.numbers[5, 5] == 2 and found.numbers[5, 30] == 3
     assert list(found.objects) == [None] * 3 and calls == [(1, 1)] and not source.missing()
     assert list(found.names) == ["wall", "book", "cup"]
-    (tmp_path / "kept" / "00-3" / "a.png.npz").write_bytes(b"damaged")
+    (tmp_path / "kept" / "00-2" / "a.png.npz").write_bytes(b"damaged")
     with pytest.raises(InputError, match=r"a.png.npz"):
         source.read("a.png")
 
