@@ -13,7 +13,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..scene import scene_meshes
-from ..scene.kinds import MESH, OBJECT_PARENT, PARENT, SPLATS, kind_of, object_id_of, parent_of, part_of
+from ..scene.kinds import MESH, OBJECT_PARENT, PARENT, SPLATS, kind_of, object_id_of, parent_above, parent_of, part_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +78,7 @@ def instances_of(
     def is_ours(obj: bpy.types.Object) -> bool:
         if kind_of(obj) != SPLATS:
             return False
-        above = obj
-        while above is not None and kind_of(above) != PARENT:
-            above = above.parent
+        above = parent_above(obj)
         # An object that the user has parented to others has none of the parents.
         return above == parent if above is not None else not members.isdisjoint(obj.users_collection)
 

@@ -73,3 +73,12 @@ def trained(capture, backend_python, tmp_path_factory) -> Path:
     command = [backend_python, "-m", "backend", "train", capture, "--out", folder, "--steps", "30"]
     subprocess.run(command, cwd=headless.ROOT, check=True, timeout=300)
     return folder
+
+
+@pytest.fixture
+def registered():
+    """The extension, registered as in Blender."""
+    extension = headless.extension()
+    extension.register()
+    yield
+    extension.unregister()

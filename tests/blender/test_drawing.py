@@ -6,8 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import headless
-
 bpy = pytest.importorskip("bpy")
 
 from objectgs.backend.shared.color.recolor import Recolor
@@ -32,14 +30,6 @@ def root(tmp_path, fresh):
     splat_arrays.register()
     yield root
     splat_arrays.unregister()
-
-
-@pytest.fixture
-def registered():
-    extension = headless.extension()
-    extension.register()
-    yield
-    extension.unregister()
 
 
 def preview_of(obj):

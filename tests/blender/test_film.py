@@ -822,14 +822,6 @@ def test_film_command_renders_only_missing_composites(shot_blend, noting_backend
     assert composed("--samples", "3") == ["0001", "0002"]
 
 
-@pytest.fixture
-def registered():
-    extension = headless.extension()
-    extension.register()
-    yield
-    extension.unregister()
-
-
 def test_compositor_operator_says_what_it_changes_and_what_is_wrong(root, registered, monkeypatch, capfd):
     scene = bpy.context.scene
     scene.objectgs.active = root
