@@ -645,6 +645,17 @@ def test_mesh_in_edit_mode_is_not_overwritten(root, folder):
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
+def test_mesh_in_edit_mode_is_not_exported(root, tmp_path):
+    """Blender has its vertices elsewhere."""
+    bpy.context.view_layer.objects.active = mesh_of(root, 1)
+    bpy.ops.object.mode_set(mode="EDIT")
+    out = tmp_path / "new" / "mug.obj"
+    with pytest.raises(InputError, match="mug mesh is in Edit Mode"):
+        mesh_export.export(root, out, "obj", None, False, False)
+    assert not out.parent.exists()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
 # Operators and panels.
 
 

@@ -48,7 +48,8 @@ def export(
         The written files.
 
     Raises:
-        InputError: There is nothing to write, Blender lacks the exporter, or `out` is a file where a folder is needed.
+        InputError: There is nothing to write, a mesh is in Edit Mode, Blender lacks the exporter, or `out` is a file
+            where a folder is needed.
         OSError: A file cannot be written.
         RuntimeError: The exporter failed.
     """
@@ -89,6 +90,7 @@ def export(
     if per_object:
         stems = distinct_stems({key: name for key, (name, _) in named_parts.items()})
         parts_of = {out / f"{stem}.{suffix}": named_parts[key][1] for key, stem in stems.items()}
+    scene.require_object_mode(mesh for parts in parts_of.values() for _, mesh in parts)
     for path in parts_of:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
     if in_capture:
