@@ -260,6 +260,17 @@ def test_user_material_is_kept_and_its_texture_updated(root, folder):
     assert image.packed_file is not None and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
 
 
+def test_packed_texture_is_kept_while_its_file_is_missing(root, folder):
+    image = image_of(mesh_of(root, 1).data.materials[0])
+    image.pack()
+    (folder / "meshes" / "1.png").unlink()
+    assert blender_scene.show_meshes(root, folder).warnings == []
+    assert image.packed_file is not None and tuple(image.size) == (4, 4)
+    write_png(folder / "meshes" / "1.png", (0, 255, 0))
+    blender_scene.show_meshes(root, folder)
+    assert image.packed_file is not None and tuple(image.pixels[:3]) == pytest.approx((0, 1, 0))
+
+
 def test_unchanged_mesh_is_not_updated(root, folder):
     obj = mesh_of(root, 1)
     obj.data.vertices[0].co.x += 5

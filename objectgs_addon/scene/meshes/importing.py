@@ -124,22 +124,26 @@ class MeshImporter:
         return obj
 
     def _update_texture(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
-        if not listed.texture.is_file():
+        if not listed.texture.is_file() and not any(image.packed_file for image in _textures(obj)):
             self.warnings.append(f"{listed.texture} is missing, so {obj.name} has no texture; extract the mesh again.")
         self._update_material(obj, listed)
 
     def _update_material(self, obj: bpy.types.Object, listed: ListedMesh) -> None:
         """Add the add-on's material to a mesh without materials; otherwise only reload the add-on's textures."""
-        slots = [slot.material for slot in obj.material_slots]
-        if not slots:
+        if not obj.material_slots:
             image = load_texture(listed.texture, obj.name, listed.key)
             self._material = material = mesh_material(obj.name, image, self._material, shading_of(self.root))
             material.diffuse_color = obj.color
             obj.data.materials.append(material)
             return
-        for image in dict.fromkeys(image for material in slots for image in textures_of(material)):
-            if image.get(MESH_KEY) == obj.get(MESH_KEY):
-                reload_texture(image, listed.texture)
+        for image in _textures(obj):
+            reload_texture(image, listed.texture)
+
+
+def _textures(obj: bpy.types.Object) -> list[bpy.types.Image]:
+    """Return the add-on's textures of a mesh, without those of other meshes in the user's own materials."""
+    images = dict.fromkeys(image for slot in obj.material_slots for image in textures_of(slot.material))
+    return [image for image in images if image.get(MESH_KEY) == obj.get(MESH_KEY)]
 
 
 def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None:

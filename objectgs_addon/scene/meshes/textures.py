@@ -32,13 +32,15 @@ def load_texture(path: Path, name: str, key: str) -> bpy.types.Image:
 
 
 def reload_texture(image: bpy.types.Image, path: Path) -> None:
-    """Reload a texture from its file; an image that the user packed into the .blend is packed again."""
+    """Reload a texture from its file; one packed into the .blend stays packed, also without a file."""
     packed = image.packed_file is not None
+    if packed and not path.is_file():
+        return
     if packed:
         image.unpack(method="REMOVE")
     image.filepath_raw = _stored_path(path)
     image.reload()
-    if packed and path.is_file():
+    if packed:
         image.pack()
 
 
