@@ -172,6 +172,26 @@ def test_moved_file_finds_its_textures(root, folder, tmp_path):
     assert all(tuple(image.size) == (4, 4) for image in found)
 
 
+@pytest.mark.parametrize("moved", ["file", "folder"])
+def test_textures_are_found_again_where_one_moved_alone(root, folder, tmp_path, moved):
+    blend = tmp_path / "one.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend))
+    if moved == "file":
+        blend = blend.rename(folder / "two.blend")
+    else:
+        folder = folder.rename(tmp_path / "elsewhere")
+    bpy.ops.wm.open_mainfile(filepath=str(blend))
+    root = next(each for each in bpy.data.collections if blender_scene.kind_of(each) == "reconstruction")
+    other, own = (image_of(mesh_of(root, object_id).data.materials[0]) for object_id in (1, 2))
+    write_png(tmp_path / "own.png", (0, 255, 0))
+    own.filepath = str(tmp_path / "own.png")
+    assert other.size[0] == 0
+    assert blender_scene.show_meshes(root, folder).updated == 1
+    assert Path(bpy.path.abspath(other.filepath)) == folder / "meshes" / "1.png" and tuple(other.size) == (4, 4)
+    assert Path(own.filepath) == tmp_path / "own.png", "a file that the user has chosen stays"
+    assert blender_scene.show_meshes(root, folder).updated == 0
+
+
 @pytest.mark.long
 def test_mesh_asset_can_be_used_in_another_file(root, folder, tmp_path):
     """As when dropped from the asset browser, which appends the collection and adds an instance of it."""

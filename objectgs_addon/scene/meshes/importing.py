@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 import numpy as np
 
@@ -70,11 +72,12 @@ class MeshImporter:
         written = f"{mesh_stamp} {texture_stamp}"
         has_pivot = target is None or (in_place and part_of(collection, OBJECT_PARENT) is not None)
         if obj is not None and in_place and has_pivot and same_mesh:
-            if not same_texture:
+            is_new = not same_texture or (listed.texture.is_file() and any(map(_is_lost, _textures(obj))))
+            if is_new:
                 self._update_texture(obj, listed)
             if written != before:
                 obj[WRITTEN] = written
-            return not same_texture
+            return is_new
         loaded = _read(listed)
         positions = loaded.vertices - self.origin
         if target is not None and collection is None:
@@ -144,6 +147,11 @@ def _textures(obj: bpy.types.Object) -> list[bpy.types.Image]:
     """Return the add-on's textures of a mesh, without those of other meshes in the user's own materials."""
     images = dict.fromkeys(image for slot in obj.material_slots for image in textures_of(slot.material))
     return [image for image in images if image.get(MESH_KEY) == obj.get(MESH_KEY)]
+
+
+def _is_lost(image: bpy.types.Image) -> bool:
+    """Return whether an image's file is missing, as where the .blend or the reconstruction folder was moved alone."""
+    return image.packed_file is None and not Path(bpy.path.abspath(image.filepath, library=image.library)).is_file()
 
 
 def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None:
