@@ -579,6 +579,15 @@ def test_export_keeps_shear(root, tmp_path):
     assert len(bpy.data.meshes) == count
 
 
+def test_exported_meshes_belong_to_the_user_where_they_are_imported(root, tmp_path):
+    mesh_export.export(root, tmp_path / "mug.usdc", "usdc", [1], False, False)
+    before = {*bpy.data.objects, *bpy.data.materials}
+    bpy.ops.wm.usd_import(filepath=str(tmp_path / "mug.usdc"))
+    found = {*bpy.data.objects, *bpy.data.materials} - before
+    assert {each.id_type for each in found} == {"OBJECT", "MATERIAL"}
+    assert not [name for each in found for name, _ in each.items() if "object" in name]
+
+
 # Faults.
 
 

@@ -130,7 +130,10 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
                 export_animations=False,
             )
         elif suffix == "usdc":
-            bpy.ops.wm.usd_export(filepath=str(path), export_materials=True, overwrite_textures=True)
+            # A mesh with the add-on's properties would be taken for the add-on's where it is imported.
+            bpy.ops.wm.usd_export(
+                filepath=str(path), export_materials=True, overwrite_textures=True, export_custom_properties=False
+            )
         else:
             axes = {"forward_axis": "Y", "up_axis": "Z"} if in_capture else {}
             bpy.ops.wm.obj_export(filepath=str(path), path_mode="COPY", export_materials=True, **axes)
