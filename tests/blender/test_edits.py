@@ -1349,6 +1349,25 @@ def test_exported_meshes_have_edits(root, tmp_path, suffix):
     assert {path.name for path in (tmp_path / "each").glob(f"*.{suffix}")} == {f"mug.{suffix}", f"can.{suffix}"}
 
 
+@pytest.mark.parametrize("is_turned", [False, True])
+def test_exported_meshes_have_the_names_of_the_scene(root, tmp_path, is_turned):
+    activate(root, 1)
+    bpy.ops.objectgs.duplicate_object()
+    if is_turned:
+        part(root, "object_parent").rotation_euler.z = 0.6
+        kinds.parent_of(root).scale.y = 2.0  # Shear needs a copy of the mesh.
+        bpy.context.view_layer.update()
+    blocks = [*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials]
+    before = [block.name for block in blocks]
+    assert bpy.ops.objectgs.export_meshes(filepath=str(tmp_path / "all"), format="glb") == {"FINISHED"}
+    assert [block.name for block in blocks] == before
+    content = (tmp_path / "all.glb").read_bytes()
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    found = {key: sorted(each["name"] for each in header[key]) for key in ("nodes", "meshes", "materials")}
+    assert found["nodes"] == ["can mesh", "mug mesh", "mug mesh.001"]
+    assert found["meshes"][:2] == found["materials"] == ["can mesh", "mug mesh"]
+
+
 @pytest.mark.parametrize("names", [("box 1", "box.1"), ("Mug", "mug")])
 def test_exported_textures_of_similar_names_are_kept_apart(root, tmp_path, names):
     for object_id, name in zip((1, 2), names, strict=True):

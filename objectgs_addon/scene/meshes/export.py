@@ -161,12 +161,14 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
     stage = bpy.data.scenes.new("ObjectGS export")
     made: list[bpy.types.Object] = []
     sheared: list[bpy.types.Mesh] = []
-    copies: dict[bpy.types.Material, tuple[bpy.types.Material, list[bpy.types.Image], str]] = {}
+    copies: dict[bpy.types.Material, tuple[bpy.types.Material, list[bpy.types.Image]]] = {}
+    names: dict[bpy.types.ID, str] = {}
     try:
         with tempfile.TemporaryDirectory() as folder:
             for collection, mesh in parts:
                 obj = mesh.copy()
                 made.append(obj)
+                _take_name(obj, mesh, names)
                 place = scene.matrix_to_capture(root, mesh) if in_capture else scene.matrix_to_world(mesh)
                 obj.parent = None
                 obj.constraints.clear()
@@ -178,6 +180,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                     # Location, rotation and scale cannot express shear.
                     obj.data = mesh.data.copy()
                     sheared.append(obj.data)
+                    _take_name(obj.data, mesh.data, names)
                     obj.data.transform(Matrix(place.tolist()), shape_keys=True)
                     if np.linalg.det(place[:3, :3]) < 0:
                         obj.data.flip_normals()
@@ -189,12 +192,8 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                     material = own.material
                     if material in ours and (prefix or recolor is not None):
                         if material not in copies:
-                            name = material.name
-                            copy, images = scene.with_own_textures(material, recolor, Path(folder), prefix)
-                            if material.library is None:
-                                # Files name the copy as the original.
-                                material.name, copy.name = f"{name} (original)", name
-                            copies[material] = copy, images, name
+                            copies[material] = scene.with_own_textures(material, recolor, Path(folder), prefix)
+                            _take_name(copies[material][0], material, names)
                         material = copies[material][0]
                     slot.link, slot.material = "OBJECT", material
             window.scene = stage
@@ -211,10 +210,19 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
             bpy.data.objects.remove(obj)
         for data in sheared:
             bpy.data.meshes.remove(data)
-        for material, (copy, images, name) in copies.items():
+        for copy, images in copies.values():
             bpy.data.materials.remove(copy)
-            if material.library is None:
-                material.name = name
             for image in images:
                 bpy.data.images.remove(image)
         bpy.data.scenes.remove(stage)
+        for original, name in names.items():
+            if original.library is None:
+                original.name = name
+
+
+def _take_name(copy: bpy.types.ID, original: bpy.types.ID, names: dict[bpy.types.ID, str]) -> None:
+    """Give a copy the original's name, which files use; `names` has the earlier names of all originals."""
+    name = names.setdefault(original, original.name)
+    if original.library is None:
+        original.name = f"{name} (original)"
+    copy.name = name
