@@ -54,9 +54,14 @@ def _undone(*_: Any) -> None:
 @bpy.app.handlers.persistent
 @writing.allowed
 def _saving(path: str = "", *_: Any) -> None:
-    """Write pending colors and transforms to objects.json before the .blend is saved at `path`."""
+    """Write pending colors and transforms to objects.json before the .blend is saved at `path`.
+
+    Transforms of a reconstruction that is in no scene anymore are not written: Blender only keeps what was deleted with
+    a scene or unlinked until another file is opened.
+    """
     for root in _accepted_roots():
-        _try(object_edits.store_edits, root)
+        if object_list.scenes_of(root):
+            _try(object_edits.store_edits, root)
         if path:
             folder_trust.store_relative(root, path)
 

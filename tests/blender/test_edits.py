@@ -619,6 +619,25 @@ def test_an_older_blend_can_show_what_another_moved(root, folder, tmp_path):
     assert entry(active()).transform is not None and entry(active(), 2) == stored
 
 
+@pytest.mark.parametrize("way", ["scene", "collection"])
+def test_moves_of_what_is_in_no_scene_are_not_stored(root, tmp_path, way):
+    """Blender keeps a deleted scene's collections, and unlinked ones, until another file is opened."""
+    if way == "scene":
+        bpy.ops.scene.new(type="FULL_COPY")
+    moved = active()
+    assert (moved == root) == (way == "collection")
+    part(moved, "object_parent").location.x += 5.0
+    if way == "scene":
+        bpy.ops.scene.delete()
+    else:
+        bpy.context.scene.collection.children.unlink(moved)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
+    assert moved.name in bpy.data.collections and entry(root).transform is None
+    bpy.context.scene.collection.children.link(moved)
+    bpy.ops.wm.save_mainfile()
+    assert entry(root).transform is not None
+
+
 def test_objects_left_out_keep_their_move(root):
     part(root, "object_parent").location.x += 1.0
     item(root).chosen = False
