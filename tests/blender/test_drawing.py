@@ -129,6 +129,27 @@ def test_preview_is_hidden_while_drawing(root):
     assert [(modifier.name, modifier.show_viewport, modifier.show_render) for modifier in obj.modifiers] == kept
 
 
+def test_updates_without_new_splats_tag_nothing(root, registered, monkeypatch):
+    """Blender would evaluate the scene a second time."""
+    owner, updates = bpy.context.scene, []
+    owner.objectgs.draw_splats = True
+    monkeypatch.setattr(viewport, "_failure", None)
+    viewport._changed(owner, None)
+    bpy.context.view_layer.update()
+    note = lambda _scene, depsgraph: updates.extend(each.id.name for each in depsgraph.updates)  # noqa: E731
+    bpy.app.handlers.depsgraph_update_post.append(note)
+    try:
+        viewport._changed(owner, None)
+        bpy.context.view_layer.update()
+        assert updates == []
+        part(root, 1).modifiers["ObjectGS Drawn"].show_render = True
+        viewport._changed(owner, None)
+        bpy.context.view_layer.update()
+    finally:
+        bpy.app.handlers.depsgraph_update_post.remove(note)
+    assert part(root, 1).name in updates and not part(root, 1).modifiers["ObjectGS Drawn"].show_render
+
+
 def test_drawing_that_fails_is_not_tried_in_each_redraw(root, registered, monkeypatch, capsys):
     """The user switches it on again once there is memory for it."""
     owner, later, tried = bpy.context.scene, [], []

@@ -79,7 +79,8 @@ def show_preview(part: bpy.types.Object, is_on: bool) -> None:
         part.modifiers.remove(hiding)
     elif not is_on:
         hiding = hiding or part.modifiers.new("ObjectGS Drawn", "NODES")
-        hiding.show_render = False
+        if hiding.show_render:  # Each assignment makes Blender evaluate the scene again.
+            hiding.show_render = False
         if hiding.node_group != (newest := hide_group()):
             hiding.node_group = newest
 
