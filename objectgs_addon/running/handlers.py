@@ -12,7 +12,7 @@ import bpy
 
 from ...backend.shared.errors import InputError
 from .. import scene
-from ..blender import messages, writing
+from ..blender import messages, undo, writing
 from ..state import folder_trust, object_edits, object_list, splat_edits
 from . import background, pointing, results
 
@@ -85,26 +85,19 @@ def _try(action: Callable[[bpy.types.Collection], None], root: bpy.types.Collect
 @bpy.app.handlers.persistent
 @writing.allowed
 def _file_loaded(*_: Any) -> None:
-    """Set the active reconstruction and fill lists of objects, which files built without a window lack.
+    """Set up reconstructions of files built without a window, and tell if the .blend is older than the folder's edits.
 
-    The lists are filled only from accepted folders, and no other folder is read. A message tells if the .blend is older
-    than the edits of objects in its folder, which exports use.
+    Exports use those edits, of objects in objects.json. Only accepted folders are read.
     """
     splat_edits.forget()
     messages.settle("", _RELOAD)
+    _set_up()
     older = []
-    for owner in bpy.data.scenes:
-        roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
-        roots = [root for root in roots if not scene.is_linked(root)]
-        if roots and owner.objectgs.active is None:
-            owner.objectgs.active = roots[0]
-        for root in filter(folder_trust.is_accepted, roots):
-            # The panel already reports a missing or invalid folder.
-            with contextlib.suppress(InputError, OSError):
-                if not root.objectgs.objects:
-                    object_edits.fill(root)
-                elif not object_list.shows_edits(root):
-                    older.append(root)
+    for root in _accepted_roots():
+        # The panel already reports a missing or invalid folder.
+        with contextlib.suppress(InputError, OSError):
+            if object_list.scenes_of(root) and not object_list.shows_edits(root):
+                older.append(root)
     active = bpy.context.scene.objectgs.active
     for root in sorted(older, key=lambda root: root == active):
         # The button acts on the active reconstruction, whose message is the latest.
@@ -112,23 +105,65 @@ def _file_loaded(*_: Any) -> None:
         messages.show(object_list.newer_edits(root), operator=_RELOAD, label=label)
 
 
+@bpy.app.handlers.persistent
+@writing.allowed
+def _imported(*_: Any) -> None:
+    """Set up reconstructions that were appended."""
+    _set_up()
+
+
+@writing.allowed
+def _enabled() -> None:
+    """Set up reconstructions of the file in which the extension is enabled."""
+    if _set_up():
+        undo.push("List of Objects")
+
+
+def _set_up() -> bool:
+    """Set the active reconstructions and fill the lists of objects that are missing, and return whether any was."""
+    changed = False
+    for owner in bpy.data.scenes:
+        roots = [root for root in owner.collection.children_recursive if scene.kind_of(root) == "reconstruction"]
+        local = next((root for root in roots if not scene.is_linked(root)), None)
+        if local is not None and owner.objectgs.active is None:
+            owner.objectgs.active = local
+            changed = True
+    for root in _accepted_roots():
+        if not root.objectgs.objects:
+            with contextlib.suppress(InputError, OSError):
+                object_edits.fill(root)
+            changed = changed or bool(root.objectgs.objects)
+    return changed
+
+
+# Blender before 4.3 has no handler for appended data.
+_IMPORTS = getattr(bpy.app.handlers, "blend_import_post", [])
+
+
 def register() -> None:
     object_edits.after_edits.append(background.fill_holes)
     bpy.app.handlers.load_pre.append(_leaving)
     bpy.app.handlers.load_post.append(_file_loaded)
+    _IMPORTS.append(_imported)
     bpy.app.handlers.save_pre.append(_saving)
     for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
         handlers.append(_undoing)
     for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         handlers.append(_undone)
+    if not bpy.app.background:
+        # A file may be open already, and cannot be changed during registration.
+        bpy.app.timers.register(_enabled, first_interval=0.0)
 
 
 def unregister() -> None:
+    if bpy.app.timers.is_registered(_enabled):
+        bpy.app.timers.unregister(_enabled)
     for handlers in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
         handlers.remove(_undone)
     for handlers in (bpy.app.handlers.undo_pre, bpy.app.handlers.redo_pre):
         handlers.remove(_undoing)
     bpy.app.handlers.save_pre.remove(_saving)
+    _IMPORTS.remove(_imported)
     bpy.app.handlers.load_post.remove(_file_loaded)
     bpy.app.handlers.load_pre.remove(_leaving)
     object_edits.after_edits.remove(background.fill_holes)

@@ -26,7 +26,7 @@ from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
 from objectgs.objectgs_addon.panels.edits import EditPanel
 from objectgs.objectgs_addon.picking import selection
 from objectgs.objectgs_addon.process.jobs import Job, State
-from objectgs.objectgs_addon.running import background, results
+from objectgs.objectgs_addon.running import background, handlers, results
 from objectgs.objectgs_addon.scene import capture, carrier, kinds
 from objectgs.objectgs_addon.scene.edits import fills, floaters, placement
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
@@ -1287,6 +1287,31 @@ def test_headless_build_shows_edits(fresh, folder):
     assert blender_scene.recolor_of(collection_of(root, 2)) == RECOLOR
     assert len(blender_scene.duplicates_of(root)[2]) == 1
     assert blender_scene.placement_of(root, collection_of(root, HUGE)) == pytest.approx(place, abs=1e-4)
+
+
+@pytest.mark.parametrize("way", ["opened", "appended", "opened before"])
+def test_files_built_without_a_window_get_the_list_of_objects(root, folder, tmp_path, told, way):
+    if way == "appended" and bpy.app.version < (4, 3, 0):
+        pytest.skip("has no handler for appended data")
+    path, extension = tmp_path / "built.blend", headless.extension()
+    root.objectgs.objects.clear()
+    bpy.context.scene.objectgs.active = None
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    if way == "appended":
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        bpy.ops.wm.append(directory=f"{path}/Collection/", filename="table top")
+    else:
+        if way == "opened before":
+            extension.unregister()
+        bpy.ops.wm.open_mainfile(filepath=str(path))
+        if way == "opened before":
+            extension.register()
+            assert active() is None
+            handlers._enabled()  # as its timer, which Blender without a window lacks
+    assert [row.name for row in active().objectgs.objects] == [
+        each.name for each in read_objects(folder / "objects.json")
+    ]
+    assert not told
 
 
 @pytest.mark.long
