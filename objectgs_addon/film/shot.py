@@ -172,7 +172,8 @@ class _Places:
 def _reset_unmoved(samples: Sequence[Sample], instances: Sequence[SplatsInstance]) -> None:
     """Remove the transforms of objects that are not moved in any sample, and have no duplicates, even hidden ones.
 
-    They keep their transforms of objects.json, which are those of the current frame, so objects that can move do not.
+    They keep their transforms of objects.json, which are those of the current frame if the scene shows the edits there,
+    so objects that can move do not.
     """
     here = np.eye(4)[None]
     counts = Counter(instance.object_id for instance in instances)

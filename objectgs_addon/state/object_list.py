@@ -173,7 +173,9 @@ def shows_edits(root: bpy.types.Collection) -> bool:
 def newer_edits(root: bpy.types.Collection) -> str:
     """Return the message that a reconstruction does not show the edits in its folder."""
     path = Reconstruction(scene.folder_of(root)).objects
-    return f"{root.name} does not show the edits in {path}, which exports use; use Reload Result to show them."
+    return (
+        f"{root.name} does not show the edits in {path}, which exports and films use; use Reload Result to show them."
+    )
 
 
 def _rows_of(root: bpy.types.Collection) -> dict[int, dict[str, Any]]:

@@ -9,8 +9,10 @@ import bpy
 
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...objectgs_addon import scene
+from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
+from ...objectgs_addon.state import object_edits, object_list
 from ...objectgs_addon.state.folder_state import folder_state
 from . import need
 
@@ -55,6 +57,20 @@ def submit_for_capture(
         f"{title} {root.name}", command, folder, command, capture, "--out", str(folder), *arguments
     )
     return background.submit(job, context.scene, operator.report)
+
+
+def store_edits(root: bpy.types.Collection) -> None:
+    """Write pending edits to objects.json before a job uses it, and tell if the scene does not show what it has.
+
+    Another scene, .blend or program may have written other edits there.
+
+    Raises:
+        InputError: objects.json cannot be used.
+        OSError: objects.json cannot be written.
+    """
+    object_edits.store_edits(root)
+    if not object_list.shows_edits(root):
+        messages.show(object_list.newer_edits(root), operator="objectgs.show_result", label="Reload Result")
 
 
 def folder_to_import_to(chosen: str, default: Callable[[], Path], capture: Path | None = None) -> Path:

@@ -9,8 +9,8 @@ from ...objectgs_addon import film, scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.film.properties import folder_of, samples_of
 from ...objectgs_addon.running import background
-from ...objectgs_addon.state import object_edits
 from ..common import need
+from ..common.jobs import store_edits
 from ..common.reporting import reports_errors
 from .output_folder import UsesOutputFolder
 
@@ -50,7 +50,7 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
         manager = context.window_manager
         manager.progress_begin(0, max(len(frames), 1))
         try:
-            object_edits.store_edits(root)
+            store_edits(root)
             shot = film.shot_of(
                 owner,
                 context.view_layer,

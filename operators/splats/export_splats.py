@@ -7,9 +7,9 @@ from bpy.props import EnumProperty, StringProperty
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
-from ...objectgs_addon.state import object_edits
 from ..common import need
 from ..common.export_dialog import ExportDialog, objects_choice
+from ..common.jobs import store_edits
 from ..common.reporting import reports_errors
 
 
@@ -65,7 +65,7 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
             arguments += ["--objects", *map(str, ids)]
         if self.per_object:
             arguments.append("--per-object")
-        object_edits.store_edits(root)
+        store_edits(root)
         job = locations.backend_job(f"Export {out.name}", "export", folder, *arguments)
         return background.submit(job, context.scene, self.report)
 

@@ -686,6 +686,27 @@ def test_opening_an_older_blend_tells_of_newer_edits(root, folder, tmp_path, tol
     assert len(told) == 1
 
 
+def test_films_and_exports_tell_of_edits_in_another_scene(root, folder, tmp_path, told, monkeypatch):
+    """They use the place that the other scene has given the object last."""
+    monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
+    scene = bpy.context.scene
+    scene.camera = next(obj for obj in scene.objects if obj.type == "CAMERA")
+    scene.frame_end = 1
+
+    def made():
+        assert bpy.ops.objectgs.film_frames() == {"FINISHED"}
+        assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
+        return [operator for text, operator in told if str(folder / "objects.json") in text]
+
+    part(root, "object_parent", 2).location.x += 1.0
+    assert made() == []
+    bpy.ops.scene.new(type="FULL_COPY")
+    part(active(), "object_parent").location.x += 5.0
+    assert made() == []
+    bpy.context.window_manager.windows[0].scene = scene
+    assert active() == root and made() == ["objectgs.show_result"] * 2
+
+
 def test_messages_about_newer_edits_name_each_reconstruction(root, folder, tmp_path, told):
     """The active one is the latest, since its button acts on it; those of others stay when it is pressed."""
     other = Path(shutil.copytree(folder, tmp_path / "other"))
