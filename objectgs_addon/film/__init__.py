@@ -3,11 +3,14 @@
 
 from .camera_path import make_path, new_camera
 from .compositing import set_up_compositor, show_frames
-from .limits import ignored_settings, rendered_twice
+from .instances import layer_of
+from .limits import empty_frames, ignored_settings, rendered_twice
 from .shot import shot_of
 
 __all__ = [
+    "empty_frames",
     "ignored_settings",
+    "layer_of",
     "make_path",
     "new_camera",
     "rendered_twice",

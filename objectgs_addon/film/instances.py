@@ -135,6 +135,15 @@ def layer_paths(view_layer: bpy.types.ViewLayer, without: bpy.types.Collection |
     return found
 
 
+def layer_of(scene: bpy.types.Scene, root: bpy.types.Collection) -> bpy.types.ViewLayer:
+    """Return the first view layer used for renders that a reconstruction is not excluded from, or else the first."""
+
+    def has_root(view_layer: bpy.types.ViewLayer) -> bool:
+        return any(not any(layer.exclude for layer in path) for path in layer_paths(view_layer).get(root, ()))
+
+    return next((each for each in scene.view_layers if each.use and has_root(each)), scene.view_layers[0])
+
+
 def world_of(obj: bpy.types.Object) -> Matrix:
     """Return an object's world matrix, computed from its parent's if hidden, since Blender may skip hidden objects."""
     if obj.visible_get() or obj.parent is None or obj.parent_type != "OBJECT" or obj.constraints:

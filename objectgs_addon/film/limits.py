@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import bpy
 
+from ...backend.shared.reconstruction.shot import Shot
 from .instances import instances_of, layer_paths
 
 _MOST_NAMES = 5
@@ -27,6 +28,16 @@ def ignored_settings(scene: bpy.types.Scene, camera: bpy.types.Object | None = N
         found.append("Holdout")
     words = [", ".join(found[:-1]), *found[-1:]]
     return f"Film frames of splats are rendered without {' and '.join(filter(None, words))}." if found else None
+
+
+def empty_frames(shot: Shot, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> str | None:
+    """Return a sentence if a shot of a reconstruction has no objects in any frame; None if it has some."""
+    if any(sample.objects for frame in shot.frames for sample in frame.samples):
+        return None
+    return (
+        f"Nothing of {root.name} is shown in renders of the view layer {view_layer.name}, so the film frames are "
+        "empty; check what is excluded or hidden in the Outliner."
+    )
 
 
 def rendered_twice(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> str | None:

@@ -67,6 +67,9 @@ def shot_of(
         raise InputError("The scene's frame range is empty; set its start and end.")
     if frames[0] < 0:
         raise InputError("The first frame is below 0, but image sequences have no negative numbers; move the shot.")
+    with bpy.context.temp_override(scene=scene, view_layer=view_layer):
+        # Without it, what is excluded from the window's view layer would stay where it is in all frames.
+        bpy.context.evaluated_depsgraph_get()
     instances = instances_of(scene, root, layer_paths(view_layer, root))
     before = scene.frame_current, scene.frame_subframe
     has_markers = any(marker.camera is not None for marker in scene.timeline_markers)

@@ -53,12 +53,12 @@ def film(options: argparse.Namespace) -> None:
     if not Reconstruction(folder).splats.is_file():
         raise InputError(f"The reconstruction folder {folder} has no splats.ply; name its present location with --dir.")
     frames = _frames(options, target)
-    shot = filming.shot_of(
-        target, target.view_layers[0], root, frames, options.subframes or samples_of(target), camera=camera
-    )
+    layer = filming.layer_of(target, root)
+    shot = filming.shot_of(target, layer, root, frames, options.subframes or samples_of(target), camera=camera)
     target.camera = camera or target.camera
-    if ignored := filming.ignored_settings(target, camera):
-        reporter.warning(ignored)
+    for problem in (filming.ignored_settings(target, camera), filming.empty_frames(shot, layer, root)):
+        if problem is not None:
+            reporter.warning(problem)
     out.mkdir(parents=True, exist_ok=True)
     # Machines that share the folder require separate files.
     path = out / (f"shot.{frames[0]:04d}-{frames[-1]:04d}.json" if options.frames else NAME)

@@ -61,8 +61,9 @@ class FilmFrames(UsesOutputFolder, bpy.types.Operator):
             )
             folder.mkdir(parents=True, exist_ok=True)
             write_shot(folder / NAME, shot)
-            if ignored := film.ignored_settings(owner):
-                self.report({"WARNING"}, ignored)
+            for problem in (film.ignored_settings(owner), film.empty_frames(shot, context.view_layer, root)):
+                if problem is not None:
+                    self.report({"WARNING"}, problem)
         finally:
             manager.progress_end()
         options = ["--png"] if settings.png else []

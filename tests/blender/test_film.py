@@ -24,6 +24,7 @@ from objectgs.objectgs_addon import film
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.film.properties import folder_of
 from objectgs.objectgs_addon.headless import filming
+from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.object_collection import center_of
 
@@ -777,6 +778,46 @@ def test_film_command_uses_the_folder_that_was_copied_with_the_file(shot_blend, 
     shutil.copytree(shot_blend.parent / "wall", farm / "wall")
     folder, output = used()
     assert folder == str(farm / "wall") and f"Using the folder {folder} instead" in output
+
+
+def test_film_operator_says_if_frames_are_empty(root, registered, monkeypatch, capfd):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
+    scene = bpy.context.scene
+    scene.objectgs.active, scene.frame_end = root, 1
+    bpy.ops.objectgs.use_folder()
+    for is_excluded in (False, True):
+        bpy.context.view_layer.layer_collection.children[root.name].exclude = is_excluded
+        assert bpy.ops.objectgs.film_frames() == {"FINISHED"}
+        assert ("Warning: Nothing of table top is shown" in capfd.readouterr().out) == is_excluded
+
+
+def test_film_command_takes_a_view_layer_with_the_reconstruction(shot_blend, noting_backend, tmp_path, capsys):
+    """And says if there is none."""
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    scene = bpy.context.scene
+    root = next(c for c in bpy.data.collections if blender_scene.kind_of(c) == "reconstruction")
+    pivot = ensure_pivot(root, 1)
+    for frame in (1, 2):
+        pivot.location.x += 1.0
+        pivot.keyframe_insert("location", frame=frame)
+    effects = scene.view_layers.new("effects")
+    scene.view_layers[0].layer_collection.children[root.name].exclude = True
+
+    def filmed():
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "layers.blend"))
+        command = ["film", str(tmp_path / "layers.blend"), "--out", str(tmp_path / "out"), "--frames", "1-2"]
+        assert headless.main(command) == 0
+        frames = read_shot(tmp_path / "out" / "shot.0001-0002.json").frames
+        return [frame.samples[0].objects for frame in frames], capsys.readouterr()
+
+    places, output = filmed()
+    assert [sorted(each) for each in places] == [[1, 2]] * 2 and "are empty" not in "".join(output)
+    assert (places[1][1].maps - places[0][1].maps)[0, 0, 3] == pytest.approx(1.0), "it moves"
+    effects = bpy.context.scene.view_layers["effects"]
+    effects.layer_collection.children["wall"].exclude = True
+    places, output = filmed()
+    assert places == [{}, {}] and "Nothing of wall is shown in renders of the view layer ViewLayer" in "".join(output)
 
 
 def test_film_command_renders_only_missing_composites(shot_blend, noting_backend, tmp_path, monkeypatch, capsys):
