@@ -12,6 +12,7 @@ from typing import Any
 
 import bpy
 
+from ...backend.shared.errors import InputError
 from ...backend.shared.formats.file_names import file_stem
 from ...backend.shared.formats.json_file import write_json
 from ...backend.shared.formats.photos_source import PhotosSource, read_source
@@ -58,9 +59,26 @@ def reconstructions_folder() -> Path:
     """Return the default folder for new reconstructions.
 
     It is not in the folder of the extension, which Blender deletes when the extension is uninstalled.
+
+    Raises:
+        InputError: as for `absolute`.
     """
     chosen = preferences().reconstructions if preferences() else ""
-    return Path(bpy.path.abspath(chosen)) if chosen else Path.home() / "ObjectGS"
+    return absolute(chosen) if chosen else Path.home() / "ObjectGS"
+
+
+def absolute(chosen: str) -> Path:
+    """Return the absolute path of a folder that the user has chosen, maybe relative to the .blend.
+
+    Raises:
+        InputError: The .blend is not saved yet, or the path has no drive.
+    """
+    folder = Path(bpy.path.abspath(chosen))
+    if not folder.is_absolute():
+        raise InputError(
+            f"The folder {chosen} is relative, or without a drive; save the .blend first, or choose another"
+        )
+    return folder
 
 
 def new_reconstruction(name: str, is_free: Callable[[Path], bool]) -> Path:

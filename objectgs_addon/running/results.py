@@ -6,10 +6,12 @@ Each function returns whether its changes require an undo step.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import bpy
 
+from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.folder import Reconstruction
 from ...backend.shared.reconstruction.record import read_record
 from .. import film, scene
@@ -45,8 +47,11 @@ def trained_on(capture: Path) -> list[str]:
     that it was imported to."""
     roots = [root for root in bpy.data.collections if scene.kind_of(root) == "reconstruction"]
     folders = {scene.folder_of(root): root.name for root in roots if folder_trust.is_accepted(root)}
-    own = reconstruction_for(capture, locations.new_reconstruction)
-    states = ((name, folder_state(folder)) for folder, name in {own: own.name, **folders}.items())
+    # There is none in a folder relative to a .blend that is not saved yet.
+    with contextlib.suppress(InputError):
+        own = reconstruction_for(capture, locations.new_reconstruction)
+        folders.setdefault(own, own.name)
+    states = ((name, folder_state(folder)) for folder, name in folders.items())
     return sorted(name for name, state in states if state.steps and state.capture == capture)
 
 

@@ -86,7 +86,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
         sources = self._sources()
-        capture = Path(bpy.path.abspath(self.folder)) if self.folder else locations.new_capture(sources)
+        capture = locations.absolute(self.folder) if self.folder else locations.new_capture(sources)
         capture = capture.resolve()
         need.require_unused(capture)
         calibration = Path(bpy.path.abspath(self.calibration)).resolve() if self.calibration else None

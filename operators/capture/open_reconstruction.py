@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Open a reconstruction folder in the scene, and accept the one that a .blend names."""
 
+import contextlib
 from pathlib import Path
 
 import bpy
 from bpy.props import BoolProperty, StringProperty
 
+from ...backend.shared.errors import InputError
 from ...backend.shared.formats.regular_file import resolved
 from ...objectgs_addon import scene
 from ...objectgs_addon.environment import locations
@@ -30,8 +32,9 @@ class OpenReconstruction(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        if not self.directory and locations.reconstructions_folder().is_dir():
-            self.directory = str(locations.reconstructions_folder() / "")
+        with contextlib.suppress(InputError):
+            if not self.directory and locations.reconstructions_folder().is_dir():
+                self.directory = str(locations.reconstructions_folder() / "")
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 

@@ -82,10 +82,11 @@ def folder_to_import_to(chosen: str, default: Callable[[], Path], capture: Path 
         capture: The capture's folder, which may be in the chosen one.
 
     Raises:
-        InputError: A job uses the folder, or it contains files that are not of a reconstruction.
+        InputError: A job uses the folder, it contains files that are not of a reconstruction, or it is relative to a
+            .blend that is not saved yet.
     """
     # Without links resolved, as collections of reconstructions store it.
-    folder = Path(os.path.abspath(bpy.path.abspath(chosen))) if chosen else default()  # noqa: PTH100
+    folder = Path(os.path.normpath(locations.absolute(chosen))) if chosen else default()
     need.require_unused(folder)
     Reconstruction(folder).require_own(capture)
     return folder

@@ -3,6 +3,7 @@
 
 import json
 import os
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_photos
+from objectgs.operators.capture.open_reconstruction import OpenReconstruction
 
 
 @pytest.fixture
@@ -73,6 +75,27 @@ def test_calibration_must_exist_and_is_used_again(submitted, tmp_path):
     for job in submitted:
         assert job.command[job.command.index("--calibration") + 1] == str(lenses)
     assert len(submitted) == 2
+
+
+def test_folders_relative_to_an_unsaved_file_are_refused(fresh, registered, tmp_path, monkeypatch):
+    """They would be in the working folder: for the backend, that of the extension, which an update deletes."""
+    jobs, preferences = [], SimpleNamespace(reconstructions="//recs/", backend_python="", detector="", segmenter="")
+    monkeypatch.setattr(background, "submit", lambda job, *_: jobs.append(job) or {"FINISHED"})
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    monkeypatch.setattr(locations, "preferences", lambda: preferences)
+    (tmp_path / "trip").mkdir()
+    for operator in (bpy.ops.objectgs.import_capture, bpy.ops.objectgs.import_photos):
+        for chosen in ("", "//recs"):
+            with pytest.raises(RuntimeError, match=r"The folder //recs/? is relative, .* save the \.blend first"):
+                operator("EXEC_DEFAULT", directory=str(tmp_path / "trip"), folder=chosen)
+    assert results.trained_on(tmp_path / "trip") == []
+    opened = SimpleNamespace(directory="")
+    context = SimpleNamespace(window_manager=SimpleNamespace(fileselect_add=lambda _: None))
+    assert OpenReconstruction.invoke(opened, context, None) == {"RUNNING_MODAL"} and opened.directory == ""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    for chosen, folder in (("", tmp_path / "recs" / "trip"), ("//mine", tmp_path / "mine")):
+        bpy.ops.objectgs.import_capture(directory=str(tmp_path / "trip"), folder=chosen)
+        assert jobs.pop().folder == folder and not jobs
 
 
 def test_same_sources_continue_in_their_capture(submitted, tmp_path):
