@@ -14,6 +14,10 @@ SUBFRAMES = 9
 """Default number of sub-frames, odd so that one is at the middle of the exposure."""
 
 
+# From Blender 4.5 on, file browsers offer a path relative to the .blend only with this option.
+_RELATIVE = {"PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else set()
+
+
 def _folder_chosen(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
     """Remember an output folder that the user has typed or chosen; Blender does not call this for one of a file."""
     if settings.folder:
@@ -26,6 +30,7 @@ class FilmProperties(bpy.types.PropertyGroup):
     folder: StringProperty(
         name="Output",
         subtype="DIR_PATH",
+        options=_RELATIVE,
         update=_folder_chosen,
         description="Output folder of the film frames; if empty, the folder film in the reconstruction folder. With "
         "several reconstructions in the scene, each has a folder in it",

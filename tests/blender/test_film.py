@@ -780,6 +780,12 @@ def test_film_command_uses_the_folder_that_was_copied_with_the_file(shot_blend, 
     assert folder == str(farm / "wall") and f"Using the folder {folder} instead" in output
 
 
+@pytest.mark.skipif(bpy.app.version < (4, 5, 0), reason="offers relative paths for all properties")
+def test_output_can_be_relative_to_the_blend(registered):
+    options = type(bpy.context.scene.objectgs_film).bl_rna.properties["folder"]
+    assert options.is_path_supports_blend_relative
+
+
 def test_film_operator_says_if_frames_are_empty(root, registered, monkeypatch, capfd):
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     monkeypatch.setattr(background, "submit", lambda *_: {"FINISHED"})
