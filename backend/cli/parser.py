@@ -364,6 +364,11 @@ def _add_export(commands: _Commands) -> None:
         help="capture: COLMAP's coordinates, as the photos' cameras have them; blender: Z up (capture)",
     )  # fmt: skip
     export.add_argument(
+        "--to-world", type=types.matrix, metavar="MATRIX",
+        help="for --coordinates blender, the 16 numbers of the world matrix of the reconstruction's empty in Blender, "
+        "if it was moved there: 1,0,0,0,0,1, and so on",
+    )  # fmt: skip
+    export.add_argument(
         "--sh-degree",
         type=int,
         choices=(0, 1, 2, 3),

@@ -84,6 +84,14 @@ def number(key: str, text: str, least: float = -math.inf, most: float = math.inf
     return value
 
 
+def matrix(text: str) -> list[list[float]]:
+    words = text.split(",")
+    if len(words) != 16:
+        raise argparse.ArgumentTypeError(f"{text} are not 16 numbers with commas between them")
+    values = [number("MATRIX", word) for word in words]
+    return [values[row : row + 4] for row in (0, 4, 8, 12)]
+
+
 def recolor(text: str) -> tuple[str, Recolor]:
     ranges = {"hue": (-0.5, 0.5), "amount": (0.0, 1.0)}
     word, given = keys(text, ("hue", "saturation", "value", "contrast", "tint", "replace", "amount"))

@@ -23,7 +23,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.reconstruction.objects import is_singular
 from ...backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot
 from ..scene.capture import origin_of
-from ..scene.kinds import parent_of
+from ..scene.kinds import parent_of, require_parent
 from ..scene.object_collection import center_of
 from .instances import SplatsInstance, evaluated_pivots, instances_of, layer_paths, world_of
 
@@ -61,8 +61,7 @@ def shot_of(
         InputError: The parent empty or the camera is missing, the camera is not perspective, the frames are empty or
             start below 0, or the reconstruction is scaled to zero.
     """
-    if parent_of(root) is None:
-        raise InputError(f"{root.name} has lost its parent empty; use Import Capture again.")
+    require_parent(root)
     if not frames:
         raise InputError("The scene's frame range is empty; set its start and end.")
     if frames[0] < 0:

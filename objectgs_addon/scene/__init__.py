@@ -11,6 +11,7 @@ from .edits.floaters import floater_counts, floating_splats, hidden_splats, upda
 from .edits.placement import (
     distance_moved,
     is_moved,
+    matrix_of_root,
     matrix_to_capture,
     matrix_to_world,
     placement_of,
@@ -110,6 +111,7 @@ __all__ = [
     "link_folder",
     "luma_of",
     "mark_asset",
+    "matrix_of_root",
     "matrix_to_capture",
     "matrix_to_world",
     "missing_fill",

@@ -14,6 +14,7 @@ from typing import Any
 import bpy
 
 from ...backend.shared.class_table import LARGEST_ID
+from ...backend.shared.errors import InputError
 
 KIND = "objectgs_kind"  # Not "objectgs": before Blender 5.0, it would collide with the property group of that name.
 OBJECT_ID = "object_id"
@@ -114,6 +115,14 @@ def part_of(collection: bpy.types.Collection, kind: str) -> bpy.types.Object | N
 def parent_of(root: bpy.types.Collection) -> bpy.types.Object | None:
     """Return the reconstruction's parent empty, or None if the user deleted it."""
     return part_of(root, PARENT)
+
+
+def require_parent(root: bpy.types.Collection) -> bpy.types.Object:
+    """Return the reconstruction's parent empty; raises InputError if the user deleted it."""
+    parent = parent_of(root)
+    if parent is None:
+        raise InputError(f"{root.name} has lost its parent empty; use Reload Result to show it again.")
+    return parent
 
 
 def adopt(

@@ -11,7 +11,7 @@ from mathutils import Matrix, Vector
 from ...backend.shared.errors import InputError
 from .cameras import widen_clipping
 from .edits.placement import matrix_to_world
-from .kinds import CAMERA, capture_of, kind_of, parent_of
+from .kinds import CAMERA, capture_of, kind_of, require_parent
 
 SMALLEST_SINE = 1e-3
 """Three points are collinear if the sine of the angle between them is at most this."""
@@ -32,7 +32,7 @@ def orient_to_ground(root: bpy.types.Collection, p1: Any, p2: Any, p3: Any) -> N
     Raises:
         InputError: The points are collinear, or the parent empty is missing.
     """
-    parent = _parent(root)
+    parent = require_parent(root)
     p1, p2, p3 = Vector(p1), Vector(p2), Vector(p3)
     first, second = p2 - p1, p3 - p1
     normal = first.cross(second)
@@ -63,7 +63,7 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
     Raises:
         InputError: The points coincide, the distance is not positive and finite, or the parent empty is missing.
     """
-    parent = _parent(root)
+    parent = require_parent(root)
     apart = (Vector(p2) - Vector(p1)).length
     if apart < 1e-12:
         raise InputError("The two points coincide; pick two different points.")
@@ -71,13 +71,6 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
         raise InputError("The distance must be greater than 0.")
     _move(parent, Matrix.Scale(distance / apart, 4))
     widen_clipping(root)
-
-
-def _parent(root: bpy.types.Collection) -> bpy.types.Object:
-    parent = parent_of(root)
-    if parent is None:
-        raise InputError(f"{root.name} has lost its parent empty; use Import Capture again.")
-    return parent
 
 
 def _move(parent: bpy.types.Object, transform: Matrix) -> None:

@@ -33,7 +33,7 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
         name="Coordinates",
         items=[
             ("capture", "Capture", "Coordinates of the captured cameras"),
-            ("blender", "Upright", "Z up, as oriented on import"),
+            ("blender", "Blender", "Positions in Blender, with Set Ground and Set Distance, as Export Meshes writes"),
         ],
     )
 
@@ -61,6 +61,9 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
             "--coordinates",
             self.coordinates,
         ]
+        if self.coordinates == "blender":
+            to_world = scene.matrix_of_root(root).ravel()
+            arguments.append(f"--to-world={','.join(map(repr, to_world.tolist()))}")
         if ids is not None:
             arguments += ["--objects", *map(str, ids)]
         if self.per_object:

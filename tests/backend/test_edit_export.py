@@ -300,6 +300,20 @@ def test_blender_coordinates_are_upright(run_command, folder, tmp_path):
     np.testing.assert_allclose(found.sh, transformed(captured, stand).sh, atol=1e-6)
 
 
+def test_blender_coordinates_follow_the_empty(run_command, folder, tmp_path):
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = -2.5 * np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]), (1e-7, -3e-9, 4)
+    numbers = ",".join(map(repr, world.ravel().tolist()))
+    options = ("--out", tmp_path / "all.ply", "--coordinates", "blender")
+    assert run_command("export", folder.folder, *options, f"--to-world={numbers}").code == 0
+    found, captured = read_splats(tmp_path / "all.ply")[0], read_splats(folder.splats)[0]
+    expected = (captured.means - (1, 2, 3)) @ world[:3, :3].T + world[:3, 3]
+    np.testing.assert_allclose(found.means, expected, atol=1e-5)
+    np.testing.assert_allclose(np.sort(found.scales), np.sort(2.5 * captured.scales), rtol=1e-5)
+    for wrong in ("1,2", numbers + ",0", numbers.replace("4.0", "nan")):
+        assert run_command("export", folder.folder, *options, f"--to-world={wrong}").code == 2
+
+
 def test_export_of_fit_warns_with_psnr(run_command, folder, tmp_path):
     training = TrainingRecord({"mode": "view"}, VotesRecord("majority", None, 1600, "0f", None))
     update_record(folder, training=training, export=ExportRecord(splats=9, anchors=3, psnr_of_export=34.62))

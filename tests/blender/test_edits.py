@@ -1336,6 +1336,22 @@ def test_files_built_without_a_window_get_the_list_of_objects(root, folder, tmp_
 
 
 @pytest.mark.long
+def test_splats_are_exported_where_blender_shows_them(root, folder, backend_python, tmp_path):
+    bpy.ops.objectgs.set_ground(points=(0, 0, 1, 1, 0.2, 1, 0, 1, 1.5))
+    bpy.ops.objectgs.set_distance(points=(0, 0, 0, 1, 0, 0), distance=2.5)
+    part(root, "object_parent", 2).location.x += 1.0
+    options = {"filepath": str(tmp_path / "all"), "coordinates": "blender"}
+    assert bpy.ops.objectgs.export_splats(**options) == {"FINISHED"}
+    table = read_vertices(tmp_path / "all.ply")
+    exported = np.stack([table[axis] for axis in "xyz"], 1)
+    for object_id in (1, 2):
+        splats = part(root, "splats", object_id)
+        matrix = placement.matrix_to_world(splats)
+        shown = carrier.read(splats.data, "position") @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(exported[table["object_id"] == object_id], shown, atol=1e-4)
+
+
+@pytest.mark.long
 def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_python, tmp_path):
     activate(root, 1)
     bpy.ops.objectgs.remove_object()

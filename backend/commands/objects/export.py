@@ -61,7 +61,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     if options.bake_background and background:
         splats = concatenate([splats, background_sphere(splats, background)])
     upright = read_upright(folder)
-    splats = _in_coordinates(splats, options.coordinates, upright, y_up=kind == "spz")
+    splats = _in_coordinates(splats, options, upright, y_up=kind == "spz")
     versions = {options.out: splats}
     if options.levels:
         reporter.status("Merging splats")
@@ -138,12 +138,14 @@ def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingRe
         )
 
 
-def _in_coordinates(splats: Splats, coordinates: str, upright: Upright, y_up: bool) -> Splats:
-    """Return the splats in the capture's coordinates, or upright as in Blender; SPZ has its own axes for both."""
-    if coordinates == "blender":
+def _in_coordinates(splats: Splats, options: argparse.Namespace, upright: Upright, y_up: bool) -> Splats:
+    """Return the splats in the capture's coordinates, or as they are in Blender; SPZ has its own axes for both."""
+    if options.coordinates == "blender":
         splats = replace(splats, means=splats.means.astype(np.float64) - upright.origin)
         stand = np.eye(4)
         stand[:3, :3], stand[:3, 3] = upright.rotation, upright.translation
+        if options.to_world is not None:
+            stand = np.array(options.to_world)
         return transformed(splats, (_Z_TO_Y_UP if y_up else np.eye(4)) @ stand)
     return transformed(splats, DOWN_TO_UP) if y_up else splats
 

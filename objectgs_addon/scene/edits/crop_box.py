@@ -12,7 +12,7 @@ from ....backend.shared.reconstruction.objects import Matrix as Rows
 from ....backend.shared.reconstruction.objects import affine_map
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import CROP_BOX, OBJECT_PARENT, SPLATS, mark, object_collections, parent_of, part_of
+from ..kinds import CROP_BOX, OBJECT_PARENT, SPLATS, mark, object_collections, part_of, require_parent
 from ..object_collection import center_of
 from .placement import matrix_to_capture, matrix_to_world
 from .single_splats import deleted_splats, selected_splats
@@ -38,11 +38,10 @@ def add_crop_box(root: bpy.types.Collection, box: Rows | None) -> bpy.types.Obje
     Raises:
         InputError: The user deleted the reconstruction's parent empty, or there are no splats.
     """
-    obj, parent = crop_box_of(root), parent_of(root)
+    obj = crop_box_of(root)
     if obj is not None:
         return obj
-    if parent is None:
-        raise InputError(f"The parent of {root.name} is gone; use Reload Result to show it again")
+    parent = require_parent(root)
     if box is None:
         local = np.linalg.inv(matrix_to_world(parent)) @ _around(root, matrix_to_world(parent))
     else:

@@ -9,7 +9,7 @@ from mathutils import Matrix
 
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import ANCHORS, MESH, OBJECT_PARENT, SPLATS, kind_of, parent_of, part_of, parts_of
+from ..kinds import ANCHORS, MESH, OBJECT_PARENT, SPLATS, kind_of, parent_of, part_of, parts_of, require_parent
 from ..object_collection import center_of
 
 PLACEMENT = "objectgs_place"
@@ -125,6 +125,15 @@ def matrix_to_world(obj: bpy.types.Object) -> np.ndarray:
 def matrix_to_capture(root: bpy.types.Collection, obj: bpy.types.Object) -> np.ndarray:
     """Return the map from local to capture coordinates of a Blender object, (4, 4) float64."""
     return _shift(origin_of(root)) @ _map(obj, parent_of(root))
+
+
+def matrix_of_root(root: bpy.types.Collection) -> np.ndarray:
+    """Return the map from capture coordinates relative to the origin to the world, (4, 4) float64.
+
+    Raises:
+        InputError: The parent empty is missing.
+    """
+    return matrix_to_world(require_parent(root))
 
 
 def distance_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> float:
