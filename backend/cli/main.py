@@ -24,6 +24,7 @@ from ..shared.errors import (
     InputError,
     ProcessLost,
     describe_missing_package,
+    is_lack_of_memory,
 )
 from ..shared.events import JsonReporter, Reporter, StagedReporter
 from ..shared.signals import held_signals
@@ -32,7 +33,6 @@ from .kernel_cache import use_private_cache
 from .parser import UsageError, build_parser
 
 _OUTPUT_ERRORS = (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EBADF, errno.EFBIG)
-_UNALLOCATED = ("allocate memory", "DefaultCPUAllocator: not enough memory")
 _LONGEST = 1000
 """Number of characters of an error message; names and paths in it may be longer."""
 _RESTART = "--restart"
@@ -174,9 +174,7 @@ def _describe_error(error: Exception) -> str | None:
             f"The GPU failed ({first}); the same command resumes from the last checkpoint, with --device cpu on the "
             "CPU; `doctor` tests the GPU."
         )
-    # torch reports a lack of memory with a RuntimeError, with other words on Windows.
-    unallocated = isinstance(error, RuntimeError) and any(words in str(error) for words in _UNALLOCATED)
-    if isinstance(error, MemoryError) or unallocated:
+    if is_lack_of_memory(error):
         return "There is not enough memory; try a smaller --max-size, --memory-mb or --max-anchors."
     if isinstance(error, ModuleNotFoundError):
         return describe_missing_package(error)

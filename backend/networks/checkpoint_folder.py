@@ -6,13 +6,13 @@ import hashlib
 import importlib.util
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ..shared.errors import InputError, MissingPackage
+from ..shared.errors import InputError, MissingPackage, is_lack_of_memory
 from ..shared.formats.json_file import parse_json
 
 PACKAGE = "transformers>=5,<6"
@@ -59,16 +59,9 @@ def not_a_config(path: Path, what: str) -> InputError:
     return InputError(f"{path} is not the config of a model; copy the checkpoint of {what} again.")
 
 
-def unfit(folder: Path, why: str) -> InputError:
+def _unfit(folder: Path, why: str) -> InputError:
     """Return the error for weights that cannot be loaded."""
     return InputError(f"The weights in {folder} do not fit its {CONFIG} ({why}); copy the checkpoint again.")
-
-
-def require_all_weights(folder: Path, loaded: dict[str, Any]) -> None:
-    """Raise InputError unless the loading info of `from_pretrained` says that every weight was in the files."""
-    for kind in ("missing", "mismatched"):
-        if names := sorted(map(str, loaded[f"{kind}_keys"])):
-            raise unfit(folder, f"{names[0]} is {kind}")
 
 
 def import_transformers(needed: str, option: str) -> Any:
@@ -108,23 +101,28 @@ def _broken(error: Exception) -> InputError:
     )
 
 
-def load_network(folder: Path, network: str, config: str, option: str) -> Any:
+def load_network(
+    folder: Path, network: str, config: str, option: str, change: Callable[[Any], None] = lambda _config: None
+) -> Any:
     """Load a network of transformers.
 
     Args:
         folder: the folder of the checkpoint.
         network, config: the classes of the network and of its config.
         option: the argument of the command that names the folder, for errors.
+        change: called with the config, which it may change.
 
     Returns:
         The network on the CPU, in float32, for inference.
 
     Raises:
-        InputError: The weights do not fit config.json, some are missing, or a package is not installed.
+        InputError: The weights do not fit config.json, some are missing, there is not enough memory for them, or a
+            package is not installed.
     """
     transformers = import_transformers(network, option)
     try:
         settings = getattr(transformers, config).from_pretrained(folder, local_files_only=True)
+        change(settings)
         loaded, info = getattr(transformers, network).from_pretrained(
             folder, config=settings, dtype=torch.float32, local_files_only=True, output_loading_info=True
         )
@@ -135,8 +133,14 @@ def load_network(folder: Path, network: str, config: str, option: str) -> Any:
             f"The model in {folder} needs the package timm; run {install_timm()} in a terminal."
         ) from error
     except Exception as error:  # Files may be damaged in any way.
-        raise unfit(folder, str(error).strip().partition("\n")[0]) from error
-    require_all_weights(folder, info)
+        if is_lack_of_memory(error):
+            raise InputError(
+                f"There is not enough memory for the model in {folder}; close other programs, or use a smaller model."
+            ) from error
+        raise _unfit(folder, str(error).strip().partition("\n")[0]) from error
+    for kind in ("missing", "mismatched"):
+        if names := sorted(map(str, info[f"{kind}_keys"])):
+            raise _unfit(folder, f"{names[0]} is {kind}")
     return loaded.eval()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 import sys
 from typing import Any
 
@@ -9,6 +11,9 @@ EXIT_DONE = 0
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
 EXIT_CANCELLED = 130
+
+_UNALLOCATED = re.compile(r"allocate memory|not enough memory|error (?:code: <)?1455\b|\(os error 12\)", re.IGNORECASE)
+"""Error texts where memory is lacking: those of torch and of systems; of Windows, only the number is in English."""
 
 
 class InputError(Exception):
@@ -41,6 +46,12 @@ class Cancelled(Exception):
 
 class ProcessLost(Exception):
     """Another process of the same training has ended; the message says what to do."""
+
+
+def is_lack_of_memory(error: BaseException) -> bool:
+    """Return whether an error means that the computer's memory, not that of a GPU, is too small."""
+    lacks = isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM)
+    return lacks or _UNALLOCATED.search(str(error)) is not None
 
 
 def describe_missing_package(error: ModuleNotFoundError) -> str:

@@ -298,6 +298,27 @@ def test_weights_that_do_not_fit_are_refused(checkpoints, tmp_path):
     refused(folder, "do not fit its config.json")
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        OSError("Cannot allocate memory (os error 12)"),
+        OSError("Die Auslagerungsdatei ist zu klein. (os error 1455)"),
+        RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 18874368 bytes."),
+        RuntimeError("Couldn't open file mapping: <model.bin>, error code: <1455>"),
+    ],
+)
+def test_weights_that_memory_is_too_small_for_are_not_taken_for_damaged_ones(tmp_path, monkeypatch, error):
+    def fail(*_, **__):
+        raise error
+
+    network = SimpleNamespace(from_pretrained=fail)
+    monkeypatch.setattr(checkpoint_folder, "import_transformers", lambda *_: SimpleNamespace(A=network, B=network))
+    with pytest.raises(InputError, match=r"There is not enough memory for the model in .*; close") as told:
+        checkpoint_folder.load_network(tmp_path, "A", "B", "--segmenter")
+    assert str(tmp_path) in str(told.value) and "copy" not in str(told.value)
+
+
 def test_colors_are_those_of_the_checkpoint(checkpoints, tmp_path, monkeypatch):
     folder = shutil.copytree(checkpoints["sam"], tmp_path / "sam")
     path = folder / "preprocessor_config.json"

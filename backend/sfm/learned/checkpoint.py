@@ -6,17 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from ...networks.checkpoint_folder import (
-    CONFIG,
-    digest_of,
-    import_transformers,
-    not_a_config,
-    read_config,
-    require_all_weights,
-    unfit,
-)
+from ...networks import checkpoint_folder
+from ...networks.checkpoint_folder import CONFIG, digest_of, not_a_config, read_config
 from ...shared.errors import InputError
 
 LIGHTGLUE, LOFTR = "lightglue", "efficientloftr"
@@ -63,17 +54,7 @@ def load_network(folder: Path, change: Callable[[Any], None] = lambda _config: N
 
     Raises:
         InputError: The folder lacks a file, is of another architecture, or its weights do not fit its config.json; or
-            transformers is not installed.
+            there is not enough memory, or transformers is not installed.
     """
     name = _CLASSES[kind_of(folder)]
-    transformers = import_transformers(f"{name}ForKeypointMatching", _OPTION)
-    try:
-        config = getattr(transformers, f"{name}Config").from_pretrained(folder, local_files_only=True)
-        change(config)
-        network, loaded = getattr(transformers, f"{name}ForKeypointMatching").from_pretrained(
-            folder, config=config, dtype=torch.float32, local_files_only=True, output_loading_info=True
-        )
-    except Exception as error:  # Files may be damaged in any way.
-        raise unfit(folder, str(error).strip().partition("\n")[0]) from error
-    require_all_weights(folder, loaded)
-    return network.eval()
+    return checkpoint_folder.load_network(folder, f"{name}ForKeypointMatching", f"{name}Config", _OPTION, change)
