@@ -18,8 +18,8 @@ from ..shared.errors import InputError
 from ..shared.formats.atomic import make_folder, write_atomic
 from ..shared.formats.json_file import parse_json
 
-_VERSION = 2
-"""Number to be raised with changes of what is found in a photo, so that kept results are not used any more."""
+_VERSION = 3
+"""Number to be raised with changes of what is found or kept, so that earlier results are not used any more."""
 
 _TURN = Image.Transpose
 _TURNS = {
@@ -82,7 +82,7 @@ class PhotoSegments:
         self._kept = kept / f"{finder.key}-{_VERSION}"
 
     def missing(self) -> list[str]:
-        """Return the photos that have no kept results, or older ones than the photo."""
+        """Return the photos that have no kept results, or those of other files of the same names."""
         return [name for name in self.photos if not self._is_kept(name)]
 
     def find(self, progress: Callable[[float, float], object]) -> None:
@@ -96,6 +96,7 @@ class PhotoSegments:
         """
         missing = self.missing()
         for done, name in enumerate(missing):
+            stamp = self._stamp(name)
             photo = read_image(self._images / name)
             photo.thumbnail((self._finder.longest_side,) * 2, Image.Resampling.BOX)
             turn, back = _turns(self._images / name)
@@ -106,7 +107,7 @@ class PhotoSegments:
 
             found = self._finder.find(np.array(upright), report)
             shapes = (Shape.of(_transposed(mask, back), None, text) for mask, text in found)
-            self._keep(name, draw_shapes(shapes, photo.size))
+            self._keep(name, stamp, draw_shapes(shapes, photo.size))
             progress(done + 1, len(missing))
 
     def read(self, photo: str) -> Segments:
@@ -125,17 +126,23 @@ class PhotoSegments:
         return Segments(renumbered, [None] * len(found), [names[number - 1] for number in found])
 
     def _path(self, name: str) -> Path:
-        # Earlier versions have kept segments of photos as they are stored, also of those that are not upright.
-        turned = "" if _turns(self._images / name)[0] is None else ".upright"
-        return self._kept / f"{name}{turned}.npz"
+        return self._kept / f"{name}.npz"
+
+    def _stamp(self, name: str) -> list[int]:
+        """Return what tells a photo from others of its name: its size in bytes, and its time, whatever the clock."""
+        status = (self._images / name).stat()
+        return [status.st_size, status.st_mtime_ns]
 
     def _is_kept(self, name: str) -> bool:
-        path = self._path(name)
-        return path.is_file() and path.stat().st_mtime >= (self._images / name).stat().st_mtime
+        try:
+            with np.load(self._path(name)) as arrays:
+                return bool(arrays["photo"].tolist() == self._stamp(name))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return False
 
-    def _keep(self, name: str, found: Segments) -> None:
-        stream = io.BytesIO()
-        np.savez_compressed(stream, ids=found.numbers.astype(np.uint16), names=np.array(found.names, np.str_))
+    def _keep(self, name: str, stamp: list[int], found: Segments) -> None:
+        stream, names = io.BytesIO(), np.array(found.names, np.str_)
+        np.savez_compressed(stream, ids=found.numbers.astype(np.uint16), names=names, photo=np.array(stamp, np.int64))
         make_folder(self._path(name).parent)
         write_atomic(self._path(name), stream.getvalue())
 
