@@ -99,7 +99,7 @@ class PhotoSegments:
             stamp = self._stamp(name)
             photo = read_image(self._images / name)
             photo.thumbnail((self._finder.longest_side,) * 2, Image.Resampling.BOX)
-            turn, back = _turns(self._images / name)
+            turn, back = _turns(self._images / name, photo)
             upright = photo if turn is None else photo.transpose(turn)
 
             def report(step: int, steps: int, done: int = done) -> None:
@@ -147,11 +147,13 @@ class PhotoSegments:
         write_atomic(self._path(name), stream.getvalue())
 
 
-def _turns(path: Path) -> tuple[Image.Transpose | None, Image.Transpose | None]:
+def _turns(path: Path, photo: Image.Image) -> tuple[Image.Transpose | None, Image.Transpose | None]:
     """Return how a photo, which was read as it is stored, becomes upright, as models expect it, and the way back."""
     try:
-        with Image.open(path) as image:
-            return _TURNS.get(image.getexif().get(ExifTags.Base.Orientation, 1), (None, None))
+        with Image.open(path) as file:
+            # The file of a PNG would be decoded again, and what was read of a TIFF has no orientation.
+            exif = (file if file.format == "TIFF" else photo).getexif()
+            return _TURNS.get(exif.get(ExifTags.Base.Orientation, 1), (None, None))
     except Exception:  # Its EXIF data may be damaged in any way.
         return None, None
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 
 from backend.capture.files import read_mask
 from backend.networks import checkpoint_folder
@@ -479,25 +479,38 @@ def test_kept_segments_are_those_of_the_photo(tmp_path):
     assert found() == [1, 0]
 
 
+def test_photos_are_decoded_once(tmp_path, monkeypatch):
+    """Pillow decodes a PNG without EXIF data completely to look for some behind its pixels."""
+    decoded, load = [], PngImagePlugin.PngImageFile.load_end
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load_end", lambda image: decoded.append(load(image)))
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    finder = Finder("segments", "00", 1024, lambda image, progress: [(image[..., 0] == 0, "")])
+    source = PhotoSegments(finder, tmp_path, ["a.png"], tmp_path / "kept")
+    assert source.missing() == ["a.png"] and not decoded
+    source.find(lambda done, total: None)
+    assert not source.missing() and source.read("a.png").numbers.all() and len(decoded) == 1
+
+
+@pytest.mark.parametrize(("name", "mode"), [("a.png", "RGB"), ("b.png", "RGBA"), ("a.tif", "RGB")])
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_models_see_photos_upright(tmp_path, orientation):
+def test_models_see_photos_upright(tmp_path, orientation, name, mode):
     pixels = np.zeros((30, 40, 3), np.uint8)
     pixels[3:9, 5:25] = 255
-    stored = Image.fromarray(pixels)
+    stored = Image.fromarray(pixels).convert(mode)
     exif = stored.getexif()
     exif[ExifTags.Base.Orientation] = orientation
-    stored.save(tmp_path / "a.png", exif=exif)
-    upright = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
+    stored.save(tmp_path / name, exif=exif)
+    upright = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / name)).convert("RGB"))
     seen = []
 
     def find(image, progress):
         seen.append(image)
         return [(image[..., 0] > 0, "")]
 
-    source = PhotoSegments(Finder("segments", "00", 1024, find), tmp_path, ["a.png"], tmp_path / "kept")
+    source = PhotoSegments(Finder("segments", "00", 1024, find), tmp_path, [name], tmp_path / "kept")
     source.find(lambda done, total: None)
     assert np.array_equal(seen[0], upright)
-    assert np.array_equal(source.read("a.png").numbers, pixels[..., 0] > 0), "segments are those of the stored pixels"
+    assert np.array_equal(source.read(name).numbers, pixels[..., 0] > 0), "segments are those of the stored pixels"
 
 
 def test_small_models_segment_a_capture(checkpoints, scene, run_command):
