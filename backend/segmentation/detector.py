@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..networks.checkpoint_folder import CONFIG, load_network, read_config, read_tokenizer
+from ..networks.checkpoint_folder import CONFIG, digest_of, load_network, read_config, read_tokenizer
 from ..shared.errors import InputError
 from .colors import read_colors, scaled_pixels
 from .detections import Detection, detections, prompt_of
@@ -41,11 +41,7 @@ class Detector:
     """
 
     def __init__(self, folder: Path, names: Sequence[str], device: torch.device | str = "cpu") -> None:
-        kind = read_config(folder, _NAME, _OPTION)["model_type"]
-        if kind != _KIND:
-            raise InputError(
-                f"{folder / CONFIG} is of a model of the type {kind}; choose a checkpoint of {_NAME} as {_OPTION}."
-            )
+        _require_kind(folder)
         tokenizer = read_tokenizer(folder, _NAME, _OPTION, _VOCABULARIES)
         self._device = torch.device(device)
         self._network: Any = load_network(folder, "GroundingDinoForObjectDetection", "GroundingDinoConfig", _OPTION).to(
@@ -83,6 +79,21 @@ class Detector:
             self._tokens,
             self._names,
             (width, height),
+        )
+
+
+def fingerprint(folder: Path) -> str:
+    """Return 8 hexadecimal digits that identify the checkpoint in a folder; raises InputError if there is none."""
+    _require_kind(folder)
+    return digest_of(folder)
+
+
+def _require_kind(folder: Path) -> None:
+    """Raise InputError if a folder has no checkpoint of a detector."""
+    kind = read_config(folder, _NAME, _OPTION)["model_type"]
+    if kind != _KIND:
+        raise InputError(
+            f"{folder / CONFIG} is of a model of the type {kind}; choose a checkpoint of {_NAME} as {_OPTION}."
         )
 
 

@@ -13,34 +13,34 @@ from ..networks.checkpoint_folder import digest_of
 from . import detector as detectors
 from . import sam3
 from .detector import Detector
-from .photo_segments import Finder
+from .photo_segments import Find, Finder
 from .sam3 import Sam3
-from .segmenter import LONGEST_SIDE, Segmenter, fingerprint
+from .segmenter import LONGEST_SIDE, Segmenter, fingerprint, kind_of
 from .selection import distinct
 
 _NO_POINTS = np.zeros((0, 2)), np.zeros(0)
 
 
-def everything(folder: Path, option: str, device: torch.device | str) -> Finder:
+def everything(folder: Path, option: str) -> Finder:
     """Return what finds all segments of photos.
 
     Args:
         folder: with a checkpoint of a segmenter.
         option: the argument of the command that names the folder, for errors.
-        device: where the model runs.
 
     Raises:
-        InputError: As of `Segmenter`.
+        InputError: As of `fingerprint`; loading raises it as `Segmenter` does.
     """
-    segmenter = Segmenter(folder, option, device)
 
-    def find(image: np.ndarray, progress: Callable[[int, int], object]) -> list[tuple[np.ndarray, str]]:
-        return [(mask, "") for mask in segmenter.everything(image, progress)]
+    def load(device: torch.device) -> Find:
+        segmenter = Segmenter(folder, option, device)
+        return lambda image, progress: [(mask, "") for mask in segmenter.everything(image, progress)]
 
-    return Finder(f"segments by a model of the type {segmenter.kind}", fingerprint(folder, option), LONGEST_SIDE, find)
+    what = f"segments by a model of the type {kind_of(folder, option)}"
+    return Finder(what, fingerprint(folder, option), LONGEST_SIDE, load)
 
 
-def boxed(folder: Path, option: str, detector: Path, names: Sequence[str], device: torch.device | str) -> Finder:
+def boxed(folder: Path, option: str, detector: Path, names: Sequence[str]) -> Finder:
     """Return what segments the boxes of what names name.
 
     Args:
@@ -48,44 +48,46 @@ def boxed(folder: Path, option: str, detector: Path, names: Sequence[str], devic
         option: the argument of the command that names the folder, for errors.
         detector: folder with a checkpoint of a detector.
         names: of objects.
-        device: where the models run.
 
     Raises:
-        InputError: As of `Segmenter` and `Detector`.
+        InputError: As of `fingerprint`; loading raises it as `Segmenter` and `Detector` do.
     """
-    detect, segmenter = Detector(detector, names, device), Segmenter(folder, option, device)
 
-    def find(image: np.ndarray, progress: Callable[[int, int], object]) -> list[tuple[np.ndarray, str]]:
-        found = detect.find(image)
-        progress(1, 2)
-        if not found:
-            return []
-        encoded = segmenter.encode(image)
-        progress(2, 2)
-        masks = np.stack([segmenter.segment(encoded, *_NO_POINTS, each.box)[0] for each in found])
-        # Boxes of one object may differ by what they contain beside it.
-        return [(masks[i], found[i].name) for i in distinct(masks, np.array([each.score for each in found]))]
+    def load(device: torch.device) -> Find:
+        detect, segmenter = Detector(detector, names, device), Segmenter(folder, option, device)
 
-    what = f"segments of {', '.join(names)} by models of the types grounding-dino and {segmenter.kind}"
-    key = f"{fingerprint(folder, option)}-{digest_of(detector)}-{_digest(names)}"
-    return Finder(what, key, detectors.LONGEST_SIDE, find)
+        def find(image: np.ndarray, progress: Callable[[int, int], object]) -> list[tuple[np.ndarray, str]]:
+            found = detect.find(image)
+            progress(1, 2)
+            if not found:
+                return []
+            encoded = segmenter.encode(image)
+            progress(2, 2)
+            masks = np.stack([segmenter.segment(encoded, *_NO_POINTS, each.box)[0] for each in found])
+            # Boxes of one object may differ by what they contain beside it.
+            return [(masks[i], found[i].name) for i in distinct(masks, np.array([each.score for each in found]))]
+
+        return find
+
+    what = f"segments of {', '.join(names)} by models of the types grounding-dino and {kind_of(folder, option)}"
+    key = f"{fingerprint(folder, option)}-{detectors.fingerprint(detector)}-{_digest(names)}"
+    return Finder(what, key, detectors.LONGEST_SIDE, load)
 
 
-def by_words(folder: Path, option: str, names: Sequence[str], device: torch.device | str) -> Finder:
+def by_words(folder: Path, option: str, names: Sequence[str]) -> Finder:
     """Return what segments what names name.
 
     Args:
         folder: with a checkpoint of SAM 3.
         option: the argument of the command that names the folder, for errors.
         names: of objects.
-        device: where the model runs.
 
     Raises:
-        InputError: As of `Sam3`.
+        InputError: A file of the folder cannot be read; loading raises it as `Sam3` does.
     """
     what = f"segments of {', '.join(names)} by a model of the type sam3"
-    model = Sam3(folder, names, option, device)
-    return Finder(what, f"{digest_of(folder)}-{_digest(names)}", sam3.LONGEST_SIDE, model.find)
+    key = f"{digest_of(folder)}-{_digest(names)}"
+    return Finder(what, key, sam3.LONGEST_SIDE, lambda device: Sam3(folder, names, option, device).find)
 
 
 def _digest(names: Sequence[str]) -> str:

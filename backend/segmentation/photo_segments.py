@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from PIL import ExifTags, Image
 
 from ..capture.files import read_image, read_mask
@@ -42,6 +43,11 @@ def is_checkpoint(folder: Path) -> bool:
     return isinstance(content, dict) and "model_type" in content
 
 
+Find = Callable[[np.ndarray, Callable[[int, int], object]], Iterable[tuple[np.ndarray, str]]]
+"""Takes an upright photo (H, W, 3) uint8, and what receives the number of finished steps, and of all; returns the mask
+(H, W) bool and the name of each segment, or ""."""
+
+
 class Finder(NamedTuple):
     """What finds the segments of a photo.
 
@@ -49,14 +55,14 @@ class Finder(NamedTuple):
         what: the kind of segments, such as "segments by a model of the type sam2".
         key: identifies the models and what they look for; results of others are not used.
         longest_side: the longer side in pixels to which larger photos are reduced before.
-        find: takes an upright photo (H, W, 3) uint8, and what receives the number of finished steps, and of all;
-            returns the mask (H, W) bool and the name of each segment, or "".
+        load: loads the models to a device, and returns what finds the segments; raises InputError if they cannot be
+            used.
     """
 
     what: str
     key: str
     longest_side: int
-    find: Callable[[np.ndarray, Callable[[int, int], object]], Iterable[tuple[np.ndarray, str]]]
+    load: Callable[[torch.device], Find]
 
 
 def chosen_checkpoint(path: Path) -> Path:
@@ -85,16 +91,20 @@ class PhotoSegments:
         """Return the photos that have no kept results, or those of other files of the same names."""
         return [name for name in self.photos if not self._is_kept(name)]
 
-    def find(self, progress: Callable[[float, float], object]) -> None:
+    def find(self, device: torch.device, progress: Callable[[float, float], object]) -> None:
         """Find the segments of the missing photos, and keep those of each photo at once.
 
         Args:
+            device: where the models run.
             progress: receives the number of finished photos, and of all that were missing; asked many times a photo.
 
         Raises:
-            InputError: A photo cannot be read.
+            InputError: A photo cannot be read, or a model cannot be used.
         """
         missing = self.missing()
+        if not missing:
+            return
+        find = self._finder.load(device)
         for done, name in enumerate(missing):
             stamp = self._stamp(name)
             photo = read_image(self._images / name)
@@ -105,7 +115,7 @@ class PhotoSegments:
             def report(step: int, steps: int, done: int = done) -> None:
                 progress(done + step / (steps + 1), len(missing))
 
-            found = self._finder.find(np.array(upright), report)
+            found = find(np.array(upright), report)
             shapes = (Shape.of(_transposed(mask, back), None, text) for mask, text in found)
             self._keep(name, stamp, draw_shapes(shapes, photo.size))
             progress(done + 1, len(missing))

@@ -52,18 +52,15 @@ class Segmenter:
         option: the argument of the command that names the folder, for errors.
         device: where the model runs.
 
-    Attributes:
-        kind: the type of the model, such as "sam2".
-
     Raises:
         InputError: The folder lacks a file, is of another architecture, or its weights do not fit its config.json; or
             a package is not installed.
     """
 
     def __init__(self, folder: Path, option: str = "--segmenter", device: torch.device | str = "cpu") -> None:
-        self.kind = _kind_of(folder, option)
-        name = _CLASSES[self.kind]
-        self._is_padded = self.kind == "sam"
+        kind = kind_of(folder, option)
+        name = _CLASSES[kind]
+        self._is_padded = kind == "sam"
         self._device = torch.device(device)
         self._network: Any = load_network(folder, f"{name}Model", f"{name}Config", option).to(self._device)
         self._colors = read_colors(folder)
@@ -177,8 +174,8 @@ class Segmenter:
         return (scaled > 0).cpu().numpy()
 
 
-def _kind_of(folder: Path, option: str) -> str:
-    """Return the type of the model in a folder; raises InputError if it has none that is known."""
+def kind_of(folder: Path, option: str) -> str:
+    """Return the type of the model in a folder, such as "sam2"; raises InputError if it has none that is known."""
     kind = str(read_config(folder, NAME, option)["model_type"])
     if kind not in _CLASSES:
         raise InputError(
@@ -189,5 +186,5 @@ def _kind_of(folder: Path, option: str) -> str:
 
 def fingerprint(folder: Path, option: str = "--segmenter") -> str:
     """Return 8 hexadecimal digits that identify the checkpoint in a folder; raises InputError if there is none."""
-    _kind_of(folder, option)
+    kind_of(folder, option)
     return digest_of(folder)

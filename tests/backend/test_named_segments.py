@@ -3,6 +3,7 @@
 import argparse
 import json
 import shutil
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -383,7 +384,7 @@ def test_words_of_sam3_become_named_objects(scene, stand_ins, tmp_path, run_comm
     assert labels_of(scene) == {"cup": 1}
 
 
-def test_found_words_are_kept(scene, stand_ins, tmp_path, run_command):
+def test_found_words_are_kept(scene, stand_ins, tmp_path, run_command, monkeypatch):
     def run(text):
         return run_command(
             "masks", scene.folder, tmp_path / "sam2", "--detector", tmp_path / "dino", "--text", text
@@ -393,7 +394,9 @@ def test_found_words_are_kept(scene, stand_ins, tmp_path, run_command):
     assert run(TEXT) == EXIT_CANCELLED and stand_ins.dino.calls == 4 and not (scene.folder / "masks").exists()
     stand_ins.dino.fails_at = None
     assert run(TEXT) == EXIT_DONE and stand_ins.dino.calls == 6
-    assert run(TEXT) == EXIT_DONE and stand_ins.dino.calls == 6, "everything is kept"
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "transformers", None)
+        assert run(TEXT) == EXIT_DONE and stand_ins.dino.calls == 6, "everything is kept"
     assert run("book; cup") == EXIT_DONE and stand_ins.dino.calls == 12 and labels_of(scene) == {"cup": 1, "book": 2}
     assert run(TEXT) == EXIT_DONE and stand_ins.dino.calls == 12 and len(labels_of(scene)) == 3
     (tmp_path / "dino" / "model.safetensors").write_bytes(b"others")
@@ -434,16 +437,16 @@ def test_boxes_of_one_segment_are_one(monkeypatch):
     masks = np.zeros((2, 8, 8), bool)
     masks[:, 2:6, 2:6], masks[0, 2, 2] = True, False
     asked = iter(masks)
-    model = SimpleNamespace(kind="sam", encode=lambda image: image, segment=lambda *_: (next(asked), 1.0))
+    model = SimpleNamespace(encode=lambda image: image, segment=lambda *_: (next(asked), 1.0))
     monkeypatch.setattr(finders, "Detector", lambda *_: SimpleNamespace(find=lambda image: found))
     monkeypatch.setattr(finders, "Segmenter", lambda *_: model)
-    monkeypatch.setattr(finders, "fingerprint", lambda *_: "1")
-    monkeypatch.setattr(finders, "digest_of", lambda *_: "2")
-    finder, steps = finders.boxed(None, "MASKS", None, ["a", "b"], "cpu"), []
-    segments = finder.find(np.zeros((8, 8, 3), np.uint8), lambda done, total: steps.append((done, total)))
+    for module, name in ((finders, "kind_of"), (finders, "fingerprint"), (detector, "fingerprint")):
+        monkeypatch.setattr(module, name, lambda *_: "1")
+    find, steps = finders.boxed(None, "MASKS", None, ["a", "b"]).load(torch.device("cpu")), []
+    segments = find(np.zeros((8, 8, 3), np.uint8), lambda done, total: steps.append((done, total)))
     assert [name for _, name in segments] == ["b"] and (segments[0][0] == masks[1]).all() and steps == [(1, 2), (2, 2)]
     found.clear()
-    assert finder.find(np.zeros((8, 8, 3), np.uint8), lambda *_: None) == []
+    assert find(np.zeros((8, 8, 3), np.uint8), lambda *_: None) == []
 
 
 def test_small_models_find_words_in_a_capture(checkpoints, scene, small_input, run_command):

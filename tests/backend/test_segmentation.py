@@ -15,6 +15,7 @@ from PIL import ExifTags, Image, ImageOps, PngImagePlugin
 from backend.capture.files import read_mask
 from backend.networks import checkpoint_folder
 from backend.networks.checkpoint_folder import PACKAGE, import_transformers
+from backend.raster.devices import CPU
 from backend.segmentation import Finder, KeptEncodings, PhotoSegments, Segmenter, fingerprint, is_checkpoint
 from backend.segmentation.selection import distinct, grid_points, is_segment
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError, MissingPackage
@@ -349,12 +350,11 @@ def test_folders_with_models_are_told_from_those_with_masks(tmp_path):
 class Shades:
     """Stands in for a segmenter: each object of the synthetic captures has a value of green of its own."""
 
-    kind = "sam2"
-
     def __init__(self):
-        self.calls, self.fails_at = 0, None
+        self.calls, self.fails_at, self.loads = 0, None, 0
 
     def __call__(self, *_):
+        self.loads += 1
         return self
 
     def everything(self, image, progress):
@@ -407,7 +407,7 @@ def test_masks_go_on_after_a_stop(scene, shades, tmp_path, run_command):
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
     assert shades.calls == 6
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
-    assert shades.calls == 6, "everything is kept"
+    assert shades.calls == 6 and shades.loads == 2, "everything is kept, so that the model is not needed"
     os.utime(scene.folder / "images" / scene.names[0], (1, 1))
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
     assert shades.calls == 7, "another photo of the same name is segmented again"
@@ -431,6 +431,10 @@ def test_masks_tell_what_is_wrong_with_a_model(scene, tmp_path, run_command):
     assert_rejected(run_command("masks", scene.folder, folder), "has no config.json")
 
 
+def finder_of(find):
+    return Finder("segments", "00", 1024, lambda device: find)
+
+
 def test_segments_are_drawn_small_over_large(tmp_path):
     """Segments that others cover completely are left out, and their numbers are without gaps."""
     (tmp_path / "images").mkdir()
@@ -438,10 +442,11 @@ def test_segments_are_drawn_small_over_large(tmp_path):
     masks = np.zeros((4, 30, 40), bool)
     masks[0], masks[1, :15], masks[2, :15, :20], masks[3, :15, 20:] = True, True, True, True
     names = ["wall", "shelf", "book", "cup"]
-    finder = Finder("segments", "00", 1024, lambda image, progress: list(zip(masks, names)))
-    source = PhotoSegments(finder, tmp_path / "images", ["a.png"], tmp_path / "kept")
+    source = PhotoSegments(
+        finder_of(lambda image, progress: list(zip(masks, names))), tmp_path / "images", ["a.png"], tmp_path / "kept"
+    )
     calls = []
-    source.find(lambda done, total: calls.append((done, total)))
+    source.find(CPU, lambda done, total: calls.append((done, total)))
     found = source.read("a.png")
     assert found.numbers[20, 5] == 1 and found.numbers[5, 5] == 2 and found.numbers[5, 30] == 3
     assert list(found.objects) == [None] * 3 and calls == [(1, 1)] and not source.missing()
@@ -465,9 +470,9 @@ def test_kept_segments_are_those_of_the_photo(tmp_path):
         os.utime(photo, (when, when))
 
     def found():
-        finder = Finder("segments", "00", 1024, lambda image, progress: [(image[..., 0] > 0, "")])
+        finder = finder_of(lambda image, progress: [(image[..., 0] > 0, "")])
         source = PhotoSegments(finder, tmp_path, ["a.png"], tmp_path / "kept")
-        source.find(lambda done, total: None)
+        source.find(CPU, lambda done, total: None)
         assert not source.missing()
         return source.read("a.png").numbers[0, [10, 30]].tolist()
 
@@ -484,10 +489,10 @@ def test_photos_are_decoded_once(tmp_path, monkeypatch):
     decoded, load = [], PngImagePlugin.PngImageFile.load_end
     monkeypatch.setattr(PngImagePlugin.PngImageFile, "load_end", lambda image: decoded.append(load(image)))
     Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
-    finder = Finder("segments", "00", 1024, lambda image, progress: [(image[..., 0] == 0, "")])
+    finder = finder_of(lambda image, progress: [(image[..., 0] == 0, "")])
     source = PhotoSegments(finder, tmp_path, ["a.png"], tmp_path / "kept")
     assert source.missing() == ["a.png"] and not decoded
-    source.find(lambda done, total: None)
+    source.find(CPU, lambda done, total: None)
     assert not source.missing() and source.read("a.png").numbers.all() and len(decoded) == 1
 
 
@@ -507,8 +512,8 @@ def test_models_see_photos_upright(tmp_path, orientation, name, mode):
         seen.append(image)
         return [(image[..., 0] > 0, "")]
 
-    source = PhotoSegments(Finder("segments", "00", 1024, find), tmp_path, [name], tmp_path / "kept")
-    source.find(lambda done, total: None)
+    source = PhotoSegments(finder_of(find), tmp_path, [name], tmp_path / "kept")
+    source.find(CPU, lambda done, total: None)
     assert np.array_equal(seen[0], upright)
     assert np.array_equal(source.read(name).numbers, pixels[..., 0] > 0), "segments are those of the stored pixels"
 

@@ -26,14 +26,14 @@ from ...capture.names import read_names
 from ...evaluation import contact_sheet
 from ...evaluation.images import id_image, thumbnail
 from ...labels.association import Association, Seen, associate, consistency, object_mask
-from ...raster import devices
-from ...segmentation import Finder, PhotoSegments, chosen_checkpoint, finders, is_checkpoint, is_sam3
+from ...segmentation import chosen_checkpoint, is_checkpoint
 from ...shared.class_table import LARGEST_ID
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
 from .former_masks import FormerMasks, read_former
+from .segmented import require_fitting_options, segmented
 
 OVERVIEW = "masks.jpg"
 """File in masks/ with a picture of some of them."""
@@ -41,13 +41,7 @@ OVERVIEW = "masks.jpg"
 _GIVEN_LABELS = "labels-given.json"
 """File of the capture with the names that its labels.json had before the first masks were made here."""
 
-_MASKS = "MASKS"
-"""The argument with the masks, for errors."""
 _SEGMENT, _FIND, _WRITE = "segment", "find", "write"
-_SEGMENTS = "masks-segments"
-"""Folder of the capture with the segments that models have found, so that a stopped command goes on."""
-_PER_PHOTO = 30.0
-"""Expected seconds in which a model segments a photo, until its pace is known."""
 _POINTS = 20_000
 """Largest number of points that segments are compared on."""
 
@@ -96,7 +90,7 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         **({_SEGMENT: ("Segmenting", 600.0)} if segments_by_model else {}),
         READ: ("Reading", 5.0), _FIND: ("Comparing", 5.0), _WRITE: ("Writing", 5.0),
     })  # fmt: skip
-    _require_fitting_options(options, segments_by_model)
+    require_fitting_options(options, segments_by_model)
     if not capture.is_dir():
         raise InputError(f"The capture {capture} does not exist; expected a folder with images/.")
     if not segments_by_model:
@@ -111,7 +105,7 @@ def masks(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{capture / 'images'} contains no photos; put them there.")
     _require_replaceable(capture, given)
     if segments_by_model:
-        source: MaskSource = _segmented(options, names, reporter)
+        source: MaskSource = segmented(options, names, reporter, _SEGMENT)
         reporter.begin(READ, "Reading the segments")
     else:
         source = open_source(given, capture, names)
@@ -155,49 +149,6 @@ def _with_names_of_files(model: Model, images: Path) -> Model:
     found = [(image, there.find(image.name)) for image in model.images]
     present = [replace(image, name=path.relative_to(images).as_posix()) for image, path in found if path is not None]
     return replace(model, images=present)
-
-
-def _segmented(options: argparse.Namespace, names: Sequence[str], reporter: StoppingReporter) -> MaskSource:
-    """Return the segments that a model finds in the photos; those that were found before are kept."""
-    if options.objects == "given":
-        raise InputError("Segments do not say which of them show the same object; use --objects find.")
-    images = Photos(options.capture).folder
-    present = [name for name in names if (images / name).is_file()]
-    source = PhotoSegments(_finder(options), images, present, options.capture / _SEGMENTS)
-    missing = len(source.missing())
-    reporter.expect({_SEGMENT: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
-    reporter.begin(_SEGMENT, f"Segmenting {missing} photos")
-    source.find(lambda done, total: reporter.progress(done, total, what="photos"))
-    return source
-
-
-def _finder(options: argparse.Namespace) -> Finder:
-    """Return what finds the segments of a photo."""
-    given, device = options.masks, devices.pick(options.device)
-    if options.text is None:
-        return finders.everything(given, _MASKS, device)
-    if is_sam3(given, _MASKS):
-        return finders.by_words(given, _MASKS, options.text, device)
-    return finders.boxed(given, _MASKS, options.detector, options.text, device)
-
-
-def _require_fitting_options(options: argparse.Namespace, segments_by_model: bool) -> None:
-    """Raise InputError if the options for names do not fit each other or the masks."""
-    if not segments_by_model:
-        if options.text is not None or options.detector is not None:
-            raise InputError(
-                f"{options.masks} has no model, which --text and --detector are for; choose a folder with one as MASKS."
-            )
-        return
-    finds_words = is_sam3(options.masks, _MASKS)
-    if options.text is None and (finds_words or options.detector is not None):
-        model = options.masks if finds_words else options.detector
-        raise InputError(f'The model in {model} finds objects by their names; add --text, such as --text "cup; book".')
-    if options.text is not None and not finds_words and options.detector is None:
-        raise InputError(
-            f"The model in {options.masks} does not find objects by their names; add --detector, a folder with a "
-            "checkpoint of Grounding DINO."
-        )
 
 
 def _require_replaceable(capture: Path, given: Path) -> None:
