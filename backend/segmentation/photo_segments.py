@@ -102,8 +102,6 @@ class PhotoSegments:
             InputError: A photo cannot be read, or a model cannot be used.
         """
         missing = self.missing()
-        if not missing:
-            return
         find = self._finder.load(device)
         for done, name in enumerate(missing):
             stamp = self._stamp(name)

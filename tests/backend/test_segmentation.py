@@ -351,10 +351,10 @@ class Shades:
     """Stands in for a segmenter: each object of the synthetic captures has a value of green of its own."""
 
     def __init__(self):
-        self.calls, self.fails_at, self.loads = 0, None, 0
+        self.calls, self.fails_at, self.loads = 0, None, []
 
-    def __call__(self, *_):
-        self.loads += 1
+    def __call__(self, folder, option, device):
+        self.loads.append(device.type)
         return self
 
     def everything(self, image, progress):
@@ -407,13 +407,22 @@ def test_masks_go_on_after_a_stop(scene, shades, tmp_path, run_command):
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
     assert shades.calls == 6
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
-    assert shades.calls == 6 and shades.loads == 2, "everything is kept, so that the model is not needed"
+    assert shades.calls == 6 and len(shades.loads) == 2, "everything is kept, so that the model is not needed"
     os.utime(scene.folder / "images" / scene.names[0], (1, 1))
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
     assert shades.calls == 7, "another photo of the same name is segmented again"
     (model / "model.safetensors").write_bytes(b"other weights")
     assert run_command("masks", scene.folder, model).code == EXIT_DONE
     assert shades.calls == 13, "by another model, all are"
+
+
+def test_models_do_not_run_on_a_gpu_that_has_failed_its_test(scene, shades, tmp_path, run_command, monkeypatch):
+    monkeypatch.setattr("backend.raster.devices.pick", lambda requested: torch.device("cuda", 0))
+    monkeypatch.setattr("backend.raster.devices.name_of", lambda device: "cuda (Small)")
+    monkeypatch.setattr("backend.commands.setup.device._known_problem", lambda device: "splats differ")
+    result = run_command("masks", scene.folder, write_checkpoint(tmp_path / "model"), "--json")
+    assert result.code == EXIT_DONE and shades.loads == ["cpu"]
+    assert "cuda (Small) fails a test (splats differ), so the CPU is used" in result.messages("warning")[0]
 
 
 def test_models_are_refused_before_photos_are_segmented(scene, shades, tmp_path, run_command):

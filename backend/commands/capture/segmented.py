@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from ...capture.mask_sources import MaskSource
 from ...capture.models import Photos
-from ...raster import devices
 from ...segmentation import Finder, PhotoSegments, finders, is_sam3
 from ...shared.errors import InputError
 from ...shared.stopping import StoppingReporter
+from ..setup.device import choose_device
 
 _MASKS = "MASKS"
 """The argument with the model, for errors."""
@@ -40,8 +40,9 @@ def segmented(options: argparse.Namespace, names: Sequence[str], reporter: Stopp
     missing = len(source.missing())
     reporter.expect({part: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
     reporter.begin(part, f"Segmenting {missing} photos")
-    device = devices.pick(options.device)
-    source.find(device, lambda done, total: reporter.progress(done, total, what="photos"))
+    if missing:
+        device = choose_device(options.device, reporter)
+        source.find(device, lambda done, total: reporter.progress(done, total, what="photos"))
     return source
 
 
