@@ -351,7 +351,7 @@ class Shades:
     """Stands in for a segmenter: each object of the synthetic captures has a value of green of its own."""
 
     def __init__(self):
-        self.calls, self.fails_at, self.loads = 0, None, []
+        self.calls, self.fails_at, self.failure, self.loads = 0, None, KeyboardInterrupt(), []
 
     def __call__(self, folder, option, device):
         self.loads.append(device.type)
@@ -360,7 +360,7 @@ class Shades:
     def everything(self, image, progress):
         progress(1, 2)
         if self.calls == self.fails_at:
-            raise KeyboardInterrupt
+            raise self.failure
         self.calls += 1
         masks = [image[..., 1] == green for green in np.unique(image[..., 1]) if green]
         progress(2, 2)
@@ -423,6 +423,35 @@ def test_models_do_not_run_on_a_gpu_that_has_failed_its_test(scene, shades, tmp_
     result = run_command("masks", scene.folder, write_checkpoint(tmp_path / "model"), "--json")
     assert result.code == EXIT_DONE and shades.loads == ["cpu"]
     assert "cuda (Small) fails a test (splats differ), so the CPU is used" in result.messages("warning")[0]
+
+
+@pytest.mark.parametrize(("loads", "fails_at"), [(False, None), (True, 0), (True, 4)])
+def test_models_that_do_not_fit_into_the_gpu_run_on_the_cpu(
+    scene, shades, tmp_path, run_command, monkeypatch, loads, fails_at
+):
+    full = torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 MiB")
+
+    def load(folder, option, device):
+        shades.loads.append(device.type)
+        shades.fails_at = fails_at if device.type == "cuda" else None
+        if device.type == "cuda" and not loads:
+            raise full
+        return shades
+
+    shades.failure = full
+    monkeypatch.setattr("backend.segmentation.finders.Segmenter", load)
+    monkeypatch.setattr("backend.commands.capture.segmented.choose_device", lambda *_: torch.device("cuda", 0))
+    result = run_command("masks", scene.folder, write_checkpoint(tmp_path / "model"), "--json")
+    assert result.code == EXIT_DONE and shades.loads == ["cuda", "cpu"] and shades.calls == 6
+    (warning,) = result.messages("warning")
+    assert warning.startswith("There is not enough GPU memory for the model, so the CPU is used, which is slower; ")
+
+
+def test_a_lack_of_memory_is_told_of_the_model(scene, shades, tmp_path, run_command):
+    shades.fails_at, shades.failure = 3, RuntimeError("DefaultCPUAllocator: can't allocate memory")
+    result = run_command("masks", scene.folder, write_checkpoint(tmp_path / "model"))
+    assert_rejected(result, "There is not enough memory for the model in", "use a smaller model")
+    assert "--max-size" not in result.err
 
 
 def test_models_are_refused_before_photos_are_segmented(scene, shades, tmp_path, run_command):

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
+
+import torch
 
 from ...capture.mask_sources import MaskSource
 from ...capture.models import Photos
+from ...raster import devices
 from ...segmentation import Finder, PhotoSegments, finders, is_sam3
-from ...shared.errors import InputError
+from ...shared.errors import InputError, is_lack_of_memory
 from ...shared.stopping import StoppingReporter
 from ..setup.device import choose_device
 
@@ -41,9 +45,31 @@ def segmented(options: argparse.Namespace, names: Sequence[str], reporter: Stopp
     reporter.expect({part: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
     reporter.begin(part, f"Segmenting {missing} photos")
     if missing:
-        device = choose_device(options.device, reporter)
-        source.find(device, lambda done, total: reporter.progress(done, total, what="photos"))
+        _find(source, choose_device(options.device, reporter), options.masks, reporter)
     return source
+
+
+def _find(source: PhotoSegments, device: torch.device, model: Path, reporter: StoppingReporter) -> None:
+    """Find the missing segments, on the CPU where the GPU's memory is too small for the model."""
+    try:
+        source.find(device, lambda done, total: reporter.progress(done, total, what="photos"))
+        return
+    except InputError:
+        raise
+    except Exception as error:
+        if is_lack_of_memory(error):
+            raise InputError(
+                f"There is not enough memory for the model in {model}; close other programs, or use a smaller model."
+            ) from error
+        if device.type == "cpu" or not devices.is_out_of_memory(error):
+            raise
+    # Here the error, and with it the model, is gone.
+    torch.cuda.empty_cache()
+    reporter.warning(
+        "There is not enough GPU memory for the model, so the CPU is used, which is slower; close programs that use "
+        "the GPU, or use a smaller model."
+    )
+    _find(source, devices.CPU, model, reporter)
 
 
 def _finder(options: argparse.Namespace) -> Finder:
