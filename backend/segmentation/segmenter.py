@@ -26,8 +26,8 @@ LONGEST_SIDE = 1024
 
 _CLASSES = {"sam": "Sam", "sam2": "Sam2", "sam2_video": "Sam2", "edgetam": "EdgeTam", "edgetam_video": "EdgeTam"}
 """Types of checkpoints, and the beginning of the names of their classes; those for videos contain the image's model."""
-_BATCH = 16
-"""Number of prompts at once; each takes some 10 MB."""
+_BATCH = 4
+"""Number of prompts at once; each takes some 130 MB, and more of them are not faster on a CPU."""
 
 
 class Encoded(NamedTuple):
