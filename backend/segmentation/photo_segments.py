@@ -66,8 +66,8 @@ class Finder(NamedTuple):
 
 
 def chosen_checkpoint(path: Path) -> Path:
-    """Return the folder of a checkpoint if its config.json or weights were chosen in place of it, or else the path."""
-    is_part = path.is_file() and (path.name == CONFIG or path.suffix == ".safetensors")
+    """Return the folder of a checkpoint if one of its files was chosen in place of it, or else the path."""
+    is_part = path.is_file() and path.suffix in (".json", ".safetensors", ".bin", ".txt")
     return path.parent if is_part and is_checkpoint(path.parent) else path
 
 

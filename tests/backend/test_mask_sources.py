@@ -507,6 +507,11 @@ def test_masks_of_other_photos_and_of_no_known_kind_are_refused(photos, tmp_path
     (tmp_path / "bomb.xml").write_text('<!DOCTYPE a [<!ENTITY b "b">]><annotations/>')
     assert_rejected(run_command("masks", photos, tmp_path / "bomb.xml"), "DTD")
     assert_rejected(run_command("masks", photos, tmp_path / "none"), "does not exist")
+    (tmp_path / "meta").mkdir()
+    model = tmp_path / "meta" / "sam_vit_h_4b8939.pth"
+    model.touch()
+    for path in (model, model.parent):
+        assert_rejected(run_command("masks", photos, path), str(path), "which cannot be read; download all files of")
 
 
 def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):

@@ -381,6 +381,13 @@ def scene(write_capture):
     return write_capture(views=6, masks=False)
 
 
+@pytest.mark.parametrize("name", ["preprocessor_config.json", "tokenizer.json", "model.safetensors", "vocab.txt"])
+def test_files_of_a_checkpoint_stand_for_its_folder(scene, shades, tmp_path, run_command, name):
+    model = write_checkpoint(tmp_path / "model")
+    (model / name).touch()
+    assert run_command("masks", scene.folder, model / name).code == EXIT_DONE and shades.calls == 6
+
+
 def test_segments_of_a_model_become_objects(scene, shades, tmp_path, run_command):
     model = write_checkpoint(tmp_path / "model")
     result = run_command("masks", scene.folder, model, "--json")

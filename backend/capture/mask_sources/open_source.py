@@ -19,6 +19,8 @@ from .images import MaskFiles, MaskFolders
 from .segments import MaskSource
 
 _LARGEST = 1 << 30
+_MODELS = (".pt", ".pth")
+"""Suffixes of files that PyTorch writes, as those in which models are published first."""
 _ACCEPTED = (
     "expected a file of COCO, CVAT or Label Studio; or a folder with files named like the photos: PNG or NumPy files "
     "with IDs, black and white images, EXR with Cryptomatte or object indices, or folders of black and white images; "
@@ -35,16 +37,31 @@ def open_source(path: Path, capture: Path, names: Sequence[str]) -> MaskSource:
         names: the names of the capture's photos.
 
     Raises:
-        InputError: it is not of a known kind, is damaged, or has masks of none of the photos.
+        InputError: it is not of a known kind, is damaged, has masks of none of the photos, or is a model as published
+            first.
     """
     photos = Photos(capture)
     if not path.exists():
         raise InputError(f"{path} does not exist; {_ACCEPTED}.")
-    sources = _of_folder(path, photos, names) if path.is_dir() else [_of_file(path, photos)]
+    is_folder = path.is_dir()
+    has_model = any(each.suffix.lower() in _MODELS for each in (path.iterdir() if is_folder else (path,)))
+    if has_model and not is_folder:
+        raise _unreadable_model(path)
+    sources = _of_folder(path, photos, names) if is_folder else [_of_file(path, photos)]
     source = max(sources, key=lambda each: len(each.photos))
     if not source.photos:
+        if has_model:
+            raise _unreadable_model(path)
         raise InputError(f"{path} has masks of none of the {len(names)} photos, such as {names[0]}; {_ACCEPTED}.")
     return source
+
+
+def _unreadable_model(path: Path) -> InputError:
+    """Return the error for a file of a model, or a folder with one, in place of masks."""
+    return InputError(
+        f"The model in {path} is a file {' or '.join(_MODELS)}, which cannot be read; download all files of it for the "
+        "package transformers to a folder, such as those of facebook/sam2.1-hiera-tiny."
+    )
 
 
 def _of_file(path: Path, photos: Photos) -> MaskSource:
