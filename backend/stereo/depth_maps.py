@@ -40,7 +40,9 @@ _SMOOTH = 0.02
 """Largest relative difference of the depths of neighboring pixels of a surface, along their planes."""
 _NEAREST_FARTHEST = 5, 99
 _NEARER, _FARTHER = 0.6, 1.5
-"""Percentiles of the depths of the capture's points in a view, and the range of depths relative to them."""
+"""Percentiles of the depths of the capture's points before a view, and the range of depths relative to them."""
+_FEWEST_SHOWN = 10
+"""Fewest points that a view must have observed for its subject to be among them."""
 _LEAST_ANGLE, _BEST_ANGLE, _LARGEST_ANGLE = 0.05, 0.2, 1.1
 """Angles in radians between neighboring photos, as seen from the scene."""
 
@@ -211,7 +213,7 @@ def _on_planes(
     pixels = np.column_stack([found.pixels[missing] + 0.5, np.ones(len(missing))])
     rays = pixels @ np.linalg.inv(found.K).T
     inverse = rays @ local.T
-    near, far = _depth_range(capture, view)
+    near, far = _depth_range(capture, index)
     allowed = (inverse > 1.0 / far) & (inverse < 1.0 / near)
     xyz = (rays[:, None] / np.where(allowed, inverse, 1.0)[:, :, None] - view.viewmat[:3, 3]) @ view.viewmat[:3, :3]
     distances = np.linalg.norm(xyz - [plane.center for plane in planes], axis=2)
@@ -281,8 +283,8 @@ def _neighbors(capture: Capture, views: Sequence[int], most: int) -> dict[int, l
     axes = matrices[:, 2, :3]
     found = {}
     for place, index in enumerate(views):
-        depths = capture.points.xyz @ axes[place] + matrices[place, 2, 3]
-        subject = centers[place] + axes[place] * (np.median(depths[depths > 0]) if (depths > 0).any() else 1.0)
+        depths = _depths_shown(capture, index)
+        subject = centers[place] + axes[place] * (np.median(depths) if len(depths) else 1.0)
         rays = centers - subject
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles = np.arccos(np.clip(rays @ rays[place], -1.0, 1.0))
@@ -300,7 +302,7 @@ def _depth_map(
     view, (height, width) = capture.views[index], image.shape
     stride = max(int(np.ceil(np.sqrt(height * width / GRID))), 1)
     rows, columns = (np.arange(RADIUS, side - RADIUS, stride) for side in (height, width))
-    near, far = _depth_range(capture, view)
+    near, far = _depth_range(capture, index)
     if not neighbors or not far > 0 or min(len(rows), len(columns)) < 2:
         return None
     pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
@@ -313,13 +315,32 @@ def _depth_map(
     return DepthMap(pixels, matches.planes, depths, (len(rows), len(columns)), stride, K, scale)
 
 
-def _depth_range(capture: Capture, view: View) -> tuple[float, float]:
-    """Return the range of depths in which surfaces are looked for; 0 if no point is in front of the camera."""
-    known = capture.points.xyz @ view.viewmat[2, :3] + view.viewmat[2, 3]
-    if not (known > 0).any():
+def _depth_range(capture: Capture, index: int) -> tuple[float, float]:
+    """Return the range of depths in which surfaces are looked for; 0 if no point is in front of the camera.
+
+    It includes those of all points, since the ones that a view observed may be few.
+    """
+    known = _depths_of(capture, index, slice(None))
+    if not len(known):
         return 0.0, 0.0
-    near, far = np.percentile(known[known > 0], _NEAREST_FARTHEST) * (_NEARER, _FARTHER)
-    return float(near), float(far)
+    ranges = [np.percentile(depths, _NEAREST_FARTHEST) for depths in (known, _depths_shown(capture, index))]
+    return _NEARER * float(min(near for near, _ in ranges)), _FARTHER * float(max(far for _, far in ranges))
+
+
+def _depths_shown(capture: Capture, index: int) -> np.ndarray:
+    """Return the depths (n,) of the points that a view observed, or of all in front of it if these are few.
+
+    Behind walls and outside the view, there may be many more, at other depths.
+    """
+    shown = _depths_of(capture, index, capture.observed(index))
+    return shown if len(shown) >= _FEWEST_SHOWN else _depths_of(capture, index, slice(None))
+
+
+def _depths_of(capture: Capture, index: int, points: np.ndarray | slice) -> np.ndarray:
+    """Return the depths (n,) of those of the given points that are in front of a view."""
+    view = capture.views[index]
+    depths = capture.points.xyz[points] @ view.viewmat[2, :3] + view.viewmat[2, 3]
+    return depths[depths > 0]
 
 
 def _others(

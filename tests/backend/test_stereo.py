@@ -80,7 +80,10 @@ def scene():
     ])  # fmt: skip
     count = len(xyz)
     points = Points(xyz, np.zeros((count, 3), np.uint8), np.zeros(count, np.float32), np.arange(count))
-    return SimpleNamespace(views=views, points=points, image=lambda i: photos[i], depths=depths, on_box=masks)
+    return SimpleNamespace(
+        views=views, points=points, image=lambda i: photos[i], observed=lambda i: np.arange(count), depths=depths,
+        on_box=masks,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +102,18 @@ def test_depths_are_exact_on_slanted_planes(scene, maps):
     errors = np.concatenate(errors)
     assert known > 0.6 * total
     assert np.median(errors) < 0.002 and (errors < AGREES).mean() > 0.98
+
+
+def test_points_that_no_photo_shows_do_not_matter(scene):
+    """As those of another storey, below the floor."""
+    rng = np.random.default_rng(0)
+    hidden = np.column_stack([rng.uniform(-3, 3, (1000, 2)), rng.uniform(-10, -8, 1000)])
+    xyz = np.concatenate([scene.points.xyz, hidden])
+    count = len(xyz)
+    points = Points(xyz, np.zeros((count, 3), np.uint8), np.zeros(count, np.float32), np.arange(count))
+    capture = SimpleNamespace(**{**vars(scene), "points": points})
+    seen = find_depth_maps(capture, range(4))
+    assert sum((found.depths > 0).sum() for found in seen.values()) > 0.4 * sum(len(m.depths) for m in seen.values())
 
 
 def test_planes_follow_the_surface(scene, maps):
