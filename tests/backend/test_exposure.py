@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from backend.training.exposure import gains as of_photos
 from backend.training.exposure.gains import differences, measure_gains, varies
 
 
@@ -54,14 +55,58 @@ def test_occluded_points_are_ignored():
 def test_few_of_many_observations_suffice(monkeypatch):
     truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
     views = photos(truth, [1] * 8, points=1000, noise=0.01)
-    whole, used = measure_gains(views), []
-    bincount = np.bincount
-    monkeypatch.setattr(np, "bincount", lambda x, *args, **options: used.append(x) or bincount(x, *args, **options))
-    monkeypatch.setattr("backend.training.exposure.gains._MOST_OBSERVATIONS", 3000)
+    whole, used, log_gains = measure_gains(views), [], of_photos._log_gains
+    monkeypatch.setattr(of_photos, "_log_gains", lambda *args: used.append(args[1]) or log_gains(*args))
+    monkeypatch.setattr(of_photos, "_MOST_OBSERVATIONS", 3000)
     found = measure_gains(views)
     np.testing.assert_allclose(found, whole, rtol=0.01)
     # The same points in all views.
-    assert all(len(points) == 2000 and (bincount(points)[::4] == 8).all() for points in used)
+    assert len(used) == 3
+    assert all(len(points) == 2000 and (np.bincount(points)[::4] == 8).all() for points in used)
+
+
+def orbit(monkeypatch, gains, brightness, wrong=0.0):
+    """Return a stand-in for a capture of 60 photos around something, each of whose points 8 neighbors show.
+
+    gains: (60,) of the photos. brightness: of what the 60 photos show. wrong: fraction of the observations that show
+    another point.
+    """
+    rng = np.random.default_rng(0)
+    points, first = 60 * 40, rng.integers(0, 60, 60 * 40)
+    colors = brightness[first][:, None] * rng.uniform(0.5, 1.5, (points, 3))
+    point = np.repeat(np.arange(points), 8)
+    view = (first[point] + np.tile(np.arange(8), points)) % 60
+    seen = colors[np.where(rng.random(len(point)) < wrong, rng.permutation(point), point)]
+    seen = np.clip(seen * np.exp(rng.normal(0, 0.05, seen.shape)) * gains[view][:, None], 0, 1)
+    monkeypatch.setattr(of_photos, "_observations", lambda _, i, __: (point[view == i], seen[view == i]))
+    return SimpleNamespace(views=range(60), train_indices=range(60), points=SimpleNamespace(xyz=np.zeros((points, 3))))
+
+
+def test_exposure_that_changes_along_a_path_is_found(monkeypatch):
+    """No point connects photos that are far apart."""
+    truth = np.exp(0.4 * np.sin(2 * np.pi * np.arange(60) / 60))
+    found = measure_gains(orbit(monkeypatch, truth, np.full(60, 0.3)))
+    np.testing.assert_allclose(found, np.repeat(truth[:, None], 3, 1), rtol=0.03)
+
+
+def test_a_dark_half_is_no_other_exposure(monkeypatch):
+    """Although what is wrong there is mostly too bright."""
+    found = measure_gains(orbit(monkeypatch, np.ones(60), np.repeat([0.12, 0.5], 30), wrong=0.05))
+    assert not varies(found)
+
+
+def test_photos_without_common_points_have_no_gain(monkeypatch):
+    """Photos are compared within their groups; black photos and channels have finite gains."""
+    gains = np.array([1, 1.25, 0.8, 0.5, 0.4, 0.625, 1, 0])
+    colors = np.random.default_rng(0).uniform(0.1, 0.6, (200, 3)) * [1, 1, 0]
+    points = [np.arange(100) + 100 * (i >= 3) for i in range(6)] + [np.arange(200, 300), np.arange(100)]
+    seen = [gains[i] * colors[points[i] % 200] for i in range(8)]
+    monkeypatch.setattr(of_photos, "_observations", lambda _, i, __: (points[i], seen[i]))
+    views = SimpleNamespace(views=range(8), train_indices=range(8), points=SimpleNamespace(xyz=np.zeros((300, 3))))
+    found = measure_gains(views)
+    assert np.isfinite(found).all() and (found[6] == 1).all() and (found[:, 2] == 1).all()
+    np.testing.assert_allclose(found[:3, 0] / found[0, 0], gains[:3] / gains[0], rtol=1e-2)
+    np.testing.assert_allclose(found[3:6, 0] / found[3, 0], gains[3:6] / gains[3], rtol=1e-2)
 
 
 def test_equal_photos_have_no_exposure_variation():

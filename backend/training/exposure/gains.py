@@ -1,8 +1,9 @@
 """Estimation of the gain of each image, for cameras with automatic exposure and white balance.
 
-COLMAP's points are observed in several images. In each channel, image i shows point p with the color gain_i * color_p;
-gains and colors are estimated alternately, as medians and means. In training, the splats are compared with images at a
-common exposure.
+COLMAP's points are observed in several images. In each channel, image i shows point p with the color gain_i * color_p.
+The logarithms of all gains and colors are found at once, by least squares: a round of gains from colors and colors from
+gains would pass a difference on to the next few photos of a path alone. Observations that disagree, as where something
+hides a point, weigh less in each further round. In training, the splats are compared with images at a common exposure.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import cg
 
 from ...shared.stopping import Check, proceed
 
@@ -19,12 +22,20 @@ if TYPE_CHECKING:
 VARIES_FROM = 0.02
 """Standard deviation of the log gains above which the exposure is considered to vary."""
 
-_MOST_OBSERVATIONS = 5_000_000
-"""Number of observations, each of which takes about 120 bytes, above which every other point is left out repeatedly."""
+_MOST_OBSERVATIONS = 1_000_000
+"""Number of observations, above which every other point is left out repeatedly."""
 
-_ROUNDS = 10
+_ROUNDS = 8
 _MIN_OBSERVATIONS = 30
+"""Fewest observations of a view, of points that other views observe, too, for a gain of its own."""
 _LIMIT = 4.0
+"""Largest gain, and inverse of the smallest, relative to the median."""
+_DARKEST = 2 / 255
+"""Darker colors count as this."""
+_DISAGREES = 0.1
+"""Difference from the logarithm of a point's color at which an observation weighs half as much."""
+_PULL = 1e-3
+"""Weight that draws log gains toward 0, for views of which no point connects them with others."""
 
 
 def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
@@ -55,28 +66,51 @@ def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
             every *= 2
             observed = {view: _of_every(every, *found) for view, found in observed.items()}
             held = sum(len(points) for points, _ in observed.values())
-    known = [i for i, (points, _) in observed.items() if len(points) >= _MIN_OBSERVATIONS]
-    if len(known) < 2:
+    if not observed:
         return gains
-    count = len(capture.points.xyz)
-    # Those of all views at once, since each view observes only some of the points.
-    all_points = np.concatenate([observed[i][0] for i in known])
-    all_colors = np.concatenate([observed[i][1] for i in known])
-    views = np.repeat(known, [len(observed[i][0]) for i in known])
-    seen = np.bincount(all_points, minlength=count)
+    points, colors = (np.concatenate(found) for found in zip(*observed.values(), strict=True))
+    views = np.repeat(list(observed), [len(found) for found, _ in observed.values()])
+    kept = np.zeros(len(points), np.bool_)
+    while not kept.all():
+        # Views with too few observations are left out, which may leave out more points, and so on.
+        kept = np.bincount(points)[points] > 1
+        kept &= np.bincount(views[kept], minlength=len(gains))[views] >= _MIN_OBSERVATIONS
+        points, colors, views = points[kept], colors[kept], views[kept]
+    known = np.unique(views)
+    if not len(known):
+        return gains
+    for channel in range(3):
+        logs = np.log(np.maximum(colors[:, channel], _DARKEST))
+        found = _log_gains(views, points, logs, len(gains), len(capture.points.xyz), check)[known]
+        found = np.clip(found - np.median(found), -np.log(_LIMIT), np.log(_LIMIT))
+        gains[known, channel] = np.exp(found - found.mean())
+    return gains
+
+
+def _log_gains(
+    view: np.ndarray, point: np.ndarray, logs: np.ndarray, views: int, points: int, check: Check
+) -> np.ndarray:
+    """Return the log gains (views,) that explain the logarithms (n,) of a channel, each of a point in a view."""
+    # Dark colors are inexact, relative to themselves.
+    bright = np.exp(_of_groups(logs, point, np.ones(len(logs)), points))[point]
+    weight, found = bright, np.zeros(views)
     for _ in range(_ROUNDS):
         check()
-        compensated = all_colors / gains[views]
-        total = [np.bincount(all_points, compensated[:, c], minlength=count) for c in range(3)]
-        mean = np.stack(total, 1) / np.maximum(seen, 1)[:, None]
-        for i in known:
-            points, colors = observed[i]
-            shared = seen[points] > 1
-            model = mean[points[shared]]
-            if shared.sum() >= _MIN_OBSERVATIONS and (model.sum(0) > 0).all():
-                gains[i] = np.clip(_ratio(colors[shared], model), 1 / _LIMIT, _LIMIT)
-        gains[known] /= np.exp(np.log(gains[known]).mean(0))
-    return gains
+        # Least squares without the colors, which are the means of what the gains leave.
+        each = csr_array((weight, (view, point)), (views, points))
+        total = np.maximum(np.bincount(point, weight, points), 1e-9)
+        matrix = (diags_array(each.sum(1) + _PULL) - each @ diags_array(1 / total) @ each.T).tocsr()
+        right = np.bincount(view, weight * (logs - _of_groups(logs, point, weight, points)[point]), views)
+        found = cg(matrix, right, found, rtol=1e-6)[0]
+        left = logs - found[view]
+        left -= _of_groups(left, point, weight, points)[point]
+        weight = bright / (1 + (left / _DISAGREES) ** 2)
+    return found
+
+
+def _of_groups(values: np.ndarray, group: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarray:
+    """Return the weighted mean (groups,) of the values (n,) in each group, 0 where there is none."""
+    return np.bincount(group, weight * values, groups) / np.maximum(np.bincount(group, weight, groups), 1e-9)
 
 
 def differences(gains: np.ndarray) -> float:
@@ -91,21 +125,6 @@ def differences(gains: np.ndarray) -> float:
 def varies(gains: np.ndarray) -> bool:
     """Return whether the gains (V, 3) differ enough to be compensated."""
     return differences(gains) > VARIES_FROM
-
-
-def _ratio(colors: np.ndarray, model: np.ndarray) -> np.ndarray:
-    """Estimate the ratio (3,) of colors (n, 3) to the model's colors (n, 3).
-
-    The median over the points, weighted by the model's color, is robust against points at edges or on shiny surfaces.
-    """
-    found = np.ones(3)
-    for c in range(3):
-        lit = model[:, c] > 0
-        ratio, weight = colors[lit, c] / model[lit, c], model[lit, c]
-        order = np.argsort(ratio)
-        passed = np.cumsum(weight[order])
-        found[c] = ratio[order][np.searchsorted(passed, 0.5 * passed[-1])]
-    return found
 
 
 def _of_every(every: int, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
