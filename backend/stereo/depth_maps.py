@@ -11,6 +11,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..capture import Capture, View
+from ..shared.stopping import Check, proceed
+from .comparison import compare
 from .patch_match import RADIUS, Others, match, match_planes, packed
 from .scene_planes import ScenePlane, find_planes
 
@@ -38,6 +40,8 @@ SPECKLE = 8
 """Fewest pixels of a grid that must form a surface."""
 _SMOOTH = 0.02
 """Largest relative difference of the depths of neighboring pixels of a surface, along their planes."""
+_MATCHING = 3
+"""Time in which a photo is matched, relative to that in which it is matched on the large planes of the scene."""
 _NEAREST_FARTHEST = 5, 99
 _NEARER, _FARTHER = 0.6, 1.5
 """Percentiles of the depths of the capture's points before a view, and the range of depths relative to them."""
@@ -87,22 +91,11 @@ class DepthMap(NamedTuple):
 
     def compare(self, view: View, xyz: np.ndarray) -> np.ndarray:
         """Return, for points (n, 3), 1 where the view shows a surface there, -1 where it shows one behind, else 0."""
-        local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-        ahead = local[:, 2] > 0
-        depth = np.where(ahead, local[:, 2], 1.0)
-        at = (local @ self.K.T)[:, :2] / depth[:, None] - 0.5
-        cell = np.round((at - RADIUS) / self.stride)
-        rows, columns = self.shape
-        inside = np.flatnonzero(ahead & (cell >= 0).all(1) & (cell[:, 0] < columns) & (cell[:, 1] < rows))
-        index = (cell[inside, 1] * columns + cell[inside, 0]).astype(np.int64)
-        known = self.depths[index] > 0
-        inside, index = inside[known], index[known]
-        # The inverse depth of the surface in the point's pixel, relative to that of the point.
-        inverse = self.planes[index, 0] + (self.planes[index, 1:] * (at[inside] - self.pixels[index])).sum(1)
-        nearness = inverse * depth[inside]
-        result = np.zeros(len(xyz), np.int64)
-        result[inside[nearness < 1 / (1 + IN_FRONT)]] = -1
-        result[inside[np.abs(nearness - 1) < AGREES]] = 1
+        result = np.empty(len(xyz), np.int64)
+        compare(
+            np.require(xyz, np.float64, ["C", "W"]), self.K @ view.viewmat[:3], RADIUS, self.stride, *self.shape,
+            self.depths, self.planes, self.pixels, IN_FRONT, AGREES, result,
+        )  # fmt: skip
         return result
 
 
@@ -114,7 +107,7 @@ def find_depth_maps(
     Args:
         capture: the capture; must be prepared.
         views: indices of the views to use.
-        progress: called with the number of photos done, and of all; at intervals also when all are done.
+        progress: called with the work done, and all of it, before each photo, and each map that points are compared to.
 
     Returns:
         The depth maps of the views that others overlap. Depths that fewer than FEWEST others find are left out, as are
@@ -124,28 +117,35 @@ def find_depth_maps(
     Raises:
         InputError: a photo cannot be read.
     """
-    scaled = {index: _gray(capture, index) for index in views}
+    matched, total = _MATCHING * len(views), (_MATCHING + 1) * len(views)
+    scaled = {}
+    for index in views:
+        progress(0, total)
+        scaled[index] = _gray(capture, index)
     neighbors = _neighbors(capture, views, NEIGHBORS)
     raw: dict[int, DepthMap] = {}
     for number, index in enumerate(views):
-        progress(number, len(views))
+        progress(_MATCHING * number, total)
         found = _depth_map(capture, scaled, index, neighbors[index])
         if found is not None:
             raw[index] = found
     agreed: dict[int, DepthMap] = {}
     for index, found in raw.items():
+        progress(matched, total)
         others = {other: raw[other] for other in neighbors[index] if other in raw}
         xyz, _ = found.points(capture.views[index])
         agreed[index] = _without_speckles(_restricted(found, _agreeing(capture, others, xyz) >= FEWEST))
     result = {}
     for index, found in agreed.items():
-        progress(len(views), len(views))
         xyz, _ = found.points(capture.views[index])
-        result[index] = _restricted(found, balance(capture, agreed, xyz, without=index) > 0)
-    return _with_planes(capture, scaled, result, lambda: progress(len(views), len(views)))
+        score = balance(capture, agreed, xyz, index, lambda: progress(matched, total))
+        result[index] = _restricted(found, score > 0)
+    return _with_planes(capture, scaled, result, lambda done: progress(matched + done, total))
 
 
-def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None) -> np.ndarray:
+def balance(
+    capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, without: int | None = None, check: Check = proceed
+) -> np.ndarray:
     """Count the views with a surface at each point, less those with one behind it.
 
     Args:
@@ -153,21 +153,26 @@ def balance(capture: Capture, maps: dict[int, DepthMap], xyz: np.ndarray, withou
         maps: their depth maps.
         xyz: (n, 3) points.
         without: a view that is not counted.
+        check: called before each map; ends the work by an exception once the user wants to stop.
 
     Returns:
         (n,) int64.
     """
     total = np.zeros(len(xyz), np.int64)
     for other, found in maps.items():
+        check()
         if other != without:
             total += found.compare(capture.views[other], xyz)
     return total
 
 
 def _with_planes(
-    capture: Capture, scaled: dict[int, tuple[np.ndarray, float]], maps: dict[int, DepthMap], check: Callable[[], None]
+    capture: Capture,
+    scaled: dict[int, tuple[np.ndarray, float]],
+    maps: dict[int, DepthMap],
+    progress: Callable[[int], None],
 ) -> dict[int, DepthMap]:
-    """Return depth maps with more depths, on the large planes of the scene; check: called for each."""
+    """Return depth maps with more depths, on the large planes of the scene; progress: called with the number done."""
     if not maps:
         return maps
     views = capture.views
@@ -180,16 +185,16 @@ def _with_planes(
         return maps
     neighbors = _neighbors(capture, list(maps), NEIGHBORS_ON_PLANES)
     filled = {}
-    for index, found in maps.items():
-        check()
+    for number, (index, found) in enumerate(maps.items()):
+        progress(number)
         filled[index] = _without_speckles(_on_planes(capture, scaled, index, found, planes, neighbors[index]))
     result = {}
     for index, found in filled.items():
-        check()
         before = maps[index]
         added = found._replace(depths=np.where(before.depths > 0, 0.0, found.depths))
         xyz, _ = added.points(views[index])
-        depths_there = _restricted(added, balance(capture, filled, xyz, without=index) > 0).depths
+        score = balance(capture, filled, xyz, index, lambda: progress(len(maps)))
+        depths_there = _restricted(added, score > 0).depths
         result[index] = found._replace(depths=np.where(before.depths > 0, before.depths, depths_there))
     return result
 

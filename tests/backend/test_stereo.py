@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numba
@@ -16,8 +17,8 @@ from backend.raster import Camera
 from backend.shared.errors import EXIT_DONE
 from backend.stereo import depth_maps
 from backend.stereo.dense_points import _thinned, find_dense_points
-from backend.stereo.depth_maps import AGREES, balance, find_depth_maps
-from backend.stereo.patch_match import Others, match_planes, packed
+from backend.stereo.depth_maps import AGREES, NEIGHBORS, DepthMap, balance, find_depth_maps
+from backend.stereo.patch_match import Matches, Others, match_planes, packed
 from backend.stereo.scene_planes import find_planes, sides_of_planes
 from backend.stereo.surface_normals import bending, concavity, measure_normals, normals_of_depth
 from backend.training.state import model_from_checkpoint, read_checkpoint
@@ -273,8 +274,9 @@ def test_balance_tells_surfaces_from_the_air(scene, maps):
 def test_points_are_on_the_surfaces_and_evenly_spread(scene):
     steps = []
     found = find_dense_points(scene, range(9), lambda done, total: steps.append((done, total)))
-    # Also asked for stops while the maps are compared.
-    assert steps == [(i, 9) for i in range(9)] + [(9, 9)] * (len(steps) - 9) and len(steps) >= 2 * 9
+    fractions = [done / total for done, total in steps]
+    assert fractions == sorted(fractions) and fractions[0] == 0 and fractions[-1] == 1
+    assert len(set(fractions)) > 9 and fractions[len(steps) // 2] < 1
     assert found.in_front.tolist() == [False] * 20 + [True] * 2
     assert len(found.xyz) == len(found.rgb) > 1000
     height = found.xyz[:, 2]
@@ -302,7 +304,28 @@ def test_many_views_are_thinned(scene, monkeypatch):
     monkeypatch.setattr("backend.stereo.dense_points.MOST_VIEWS", 5)
     steps = []
     found = find_dense_points(scene, range(9), lambda done, total: steps.append((done, total)))
-    assert steps[:5] == [(i, 5) for i in range(5)] and set(steps[5:]) == {(5, 5)} and len(found.xyz) > 300
+    assert {total for _, total in steps} == {5 * 4, 1} and len(found.xyz) > 300
+
+
+def test_it_stops_before_each_photo_and_each_map(scene, monkeypatch):
+    """Matching is replaced by the true depths."""
+    log, compare = [], DepthMap.compare
+    numbers = itertools.cycle(range(9))
+
+    def match(_image, pixels, *_):
+        depths = scene.depths[next(numbers)][pixels[:, 1], pixels[:, 0]]
+        planes = np.column_stack([1 / depths, 0 * depths, 0 * depths]).astype(np.float32)
+        return Matches(planes, np.ones(len(depths), np.float32))
+
+    monkeypatch.setattr(depth_maps, "match", match)
+    monkeypatch.setattr(DepthMap, "compare", lambda *args: log.append("map") or compare(*args))
+    capture = SimpleNamespace(**{**vars(scene), "image": lambda i: log.append("photo") or scene.image(i)})
+    find_dense_points(capture, range(9), lambda *_: log.append("check"))
+    between = " ".join(log).split("check")
+    assert max(part.count("photo") for part in between) == 1
+    # A map is first compared with those of its neighbors alone.
+    assert max(part.count("map") for part in between) <= NEIGHBORS
+    assert sum(part.count("map") == 1 for part in between) > 9 * 8
 
 
 def test_views_alone_find_nothing(scene):
