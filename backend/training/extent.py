@@ -17,6 +17,9 @@ SURROUNDINGS = 10.0
 _VIEWS = 60
 """Largest number of views in which the size of pixels is measured."""
 
+_POINTS = 100_000
+"""Largest number of points, spread evenly, at which the size of pixels is measured."""
+
 _PERCENTILE = 98
 """Percentile of the points' distances that is the radius; few points beyond it are on a surface."""
 
@@ -38,7 +41,7 @@ def extent_of(capture: Capture) -> Extent:
 
 def pixel_size(capture: Capture, check: Check = proceed) -> float:
     """Return the median side of a pixel at the points that it shows, in world units; infinite if none shows any."""
-    xyz, sizes = capture.points.xyz, []
+    xyz, sizes = capture.points.xyz[:: -(-len(capture.points.xyz) // _POINTS) or 1], []
     for index in np.unique(np.linspace(0, len(capture.views) - 1, min(len(capture.views), _VIEWS)).astype(int)):
         check()
         view = capture.views[index]

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -515,6 +516,20 @@ def test_pixels_are_measured_where_they_show_points(tiny):
     at = np.array([[0, 0, 2.0], [0, 0, 4.0], [0, 0, 6.0], [0, 0, -1.0], [90.0, 0, 9.0], [0, -9.0, 9.0]])
     assert pixel_size(SimpleNamespace(views=[pixel], points=SimpleNamespace(xyz=at))) == pytest.approx(4.0 / 50.0)
     assert pixel_size(SimpleNamespace(views=[pixel], points=SimpleNamespace(xyz=at[3:]))) == np.inf
+
+
+def test_pixels_are_measured_at_some_of_many_points(tiny, monkeypatch):
+    capture, _ = tiny()
+    at = np.random.default_rng(0).normal(0, 0.5, (100_000, 3))
+    many = SimpleNamespace(views=capture.views, points=SimpleNamespace(xyz=at))
+    whole = pixel_size(many)
+    monkeypatch.setattr("backend.training.extent._POINTS", 10_000)
+    tracemalloc.start()
+    try:
+        assert pixel_size(many) == pytest.approx(whole, rel=0.01)
+        assert tracemalloc.get_traced_memory()[1] < 10_000 * (len(capture.views) * 3 + 20) * 8
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("settings", [SMALL, FLAT], ids=["3d", "2d"])
