@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from backend.raster import devices
-from backend.training.exposure.photo_colors import PhotoColors, corrected, fit_correction
+from backend.training.exposure import photo_colors
+from backend.training.exposure.photo_colors import PhotoColors, begin_colors, corrected, fit_correction
 
 
 def test_correction_applies_to_render_and_background() -> None:
@@ -79,3 +82,17 @@ def test_correction_is_fitted_to_a_photo() -> None:
     gray = fit_correction(np.full((8, 9, 3), 0.5), render)
     assert not gray[0].any(), "a render of one color says nothing about the gain"
     np.testing.assert_allclose(gray[1], render.mean((0, 1)) - 0.5, atol=1e-6)
+
+
+def test_correction_begins_at_the_common_exposure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in training, where the photo over its gain is compared with the render."""
+    rng = np.random.default_rng(0)
+    render, gain, true = rng.uniform(0.1, 0.6, (8, 9, 3)), np.array([0.5, 1.0, 1.2]), np.array([[0.1], [0.05]])
+    photo = gain * (np.exp(true[0]) * render + true[1])
+    scene = SimpleNamespace(
+        camera=lambda index: None, gains=gain[None], capture=SimpleNamespace(image=lambda index: 255 * photo)
+    )
+    monkeypatch.setattr(photo_colors, "draw", lambda *_, **__: SimpleNamespace(image=gain * render))
+    colors = PhotoColors(1, (0,), devices.CPU)
+    begin_colors(colors, None, scene, [0])
+    np.testing.assert_allclose(colors.values[0], np.repeat(true, 3, 1), atol=1e-6)

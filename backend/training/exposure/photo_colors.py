@@ -124,6 +124,8 @@ def begin_colors(colors: PhotoColors | None, model: ObjectModel, scene: Scene, i
     for index in indices:
         render = draw(model, scene.camera(index), want_ids=False).image
         found = fit_correction(render, scene.capture.image(index) / 255)
+        # Both are at the photo's exposure; in training, at the common one.
+        found[1] /= scene.gains[index]
         colors.values[index] = torch.from_numpy(found).to(colors.values)
 
 
