@@ -91,6 +91,9 @@ def _thinned(xyz: np.ndarray, size: np.ndarray, known: np.ndarray, check: Check 
         here = np.flatnonzero(level == each)
         before = np.concatenate([known, xyz[kept]])
         cells = np.floor(np.concatenate([before, xyz[here]]) / _FINER ** float(each)).astype(np.int64)
-        _, first = np.unique(cells, axis=0, return_index=True)
+        # As np.unique does, which takes three times as long for rows.
+        order = np.lexsort(cells.T[::-1])
+        ordered = cells[order]
+        first = order[np.append(True, (ordered[1:] != ordered[:-1]).any(1))]
         kept = np.concatenate([kept, here[first[first >= len(before)] - len(before)]])
     return np.sort(kept)
