@@ -35,6 +35,9 @@ PIXELS_TO_READ = 3e8
 """Largest total number of pixels of photos that are read for a plan, in a few seconds; larger captures are only read
 when training begins."""
 
+MOST_LIKE_HELD_OUT = 0.25
+"""Largest fraction of the different views that is left out since held-out views show the same."""
+
 NAMED = 5
 """Largest number of objects or views that a reason names."""
 
@@ -248,20 +251,26 @@ def _duplicate_views(context: PlanningContext) -> Decision | None:
     if not capture.prepared:
         return None
     repeated, flattering = duplicate_views(capture, context.check), views_like_held_out(capture, context.check)
-    if len({*repeated, *flattering}) == len(capture.train_indices):
-        flattering = []  # Nothing would be left to train on.
-    repeated = [i for i in repeated if i not in flattering]
-    found, reasons = sorted([*repeated, *flattering]), []
-    if not found:
-        return None
+    different = len(capture.train_indices) - len(repeated)
+    # Of photos in bursts, one of almost each may be held out.
+    needed = len({*flattering} - {*repeated}) > MOST_LIKE_HELD_OUT * different
+    left_out, kept = ([], [i for i in flattering if i not in repeated]) if needed else (flattering, [])
+    repeated = [i for i in repeated if i not in left_out]
+    reasons = []
     for views, other in (
         (repeated, "an earlier view"),
-        (flattering, "a held-out view, whose figures would be too good if they were trained on"),
+        (left_out, "a held-out view, whose figures would be too good if they were trained on"),
+        (kept, "a held-out view, whose figures will be too good, but they are needed; test.txt may name others"),
     ):
         if views:
             each = f"each shows the same image from the same position as {other}"
             reasons.append(f"{each}: {_listed(context.names(views))}")
-    why = "; ".join(reasons)
+    if not reasons:
+        return None
+    why, found = "; ".join(reasons), sorted([*repeated, *left_out])
+    if not found:
+        what, names = f"training on {_views(len(kept))}", context.names(kept)
+        return Decision("duplicate-views", what, True, why, len(kept) < len(capture.train_indices), views=names)
     return Decision("duplicate-views", f"training on {_views(len(found))}", False, why, views=context.names(found))
 
 

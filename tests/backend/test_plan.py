@@ -179,6 +179,26 @@ def test_duplicate_views_are_found(write_capture, tmp_path):
     assert views_like_held_out(loaded(scene, tmp_path)) == []
 
 
+@pytest.mark.parametrize(("repeats", "held_out"), [(7, 1), (2, 6), (2, 7)])
+def test_each_place_of_bursts_is_trained_on(write_capture, tmp_path, repeats, held_out):
+    """Also if nothing but held-out views is repeated, the plan says that these flatter."""
+    scene, places = write_capture(views=14, size=(64, 48)), 14 // repeats
+    for view in range(14):
+        first = repeats * (view // repeats)
+        for part in (scene.quaternions, scene.viewmats, scene.seen, scene.pixels):
+            part[view] = part[first]
+        for part in ("images", "masks"):
+            source, target = (scene.folder / part / scene.names[i] for i in (first, view))
+            if first != view:
+                shutil.copy(source, target)
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    (scene.folder / "test.txt").write_text("\n".join(scene.names[::repeats][:held_out]))
+    plan = planned(loaded(scene, tmp_path))
+    kept = [i for i in loaded(scene, tmp_path).train_indices if scene.names[i] not in plan.views_left_out]
+    assert [i // repeats for i in kept] == list(range(places))
+    assert "figures will be too good, but they are needed" in plan["duplicate-views"].why
+
+
 def test_capture_of_one_photo_keeps_a_training_view(write_capture, tmp_path):
     scene = write_capture(views=4, size=(64, 48))
     for view in (1, 2, 3):
