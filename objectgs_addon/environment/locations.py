@@ -185,9 +185,8 @@ def segmenter() -> Path | None:
     return Path(bpy.path.abspath(chosen)) if chosen else None
 
 
-def segmenter_options() -> list[str]:
-    """Return the options of `point` and `label` for the segmentation model."""
-    folder = segmenter()
+def segmenter_options(folder: Path | None) -> list[str]:
+    """Return the options of `point` and `label` for the folder of a segmentation model, or None."""
     return [] if folder is None else ["--segmenter", str(folder)]
 
 

@@ -38,7 +38,9 @@ class _Session:
         has_splats = Reconstruction(self.folder).splats.is_file()
         self.keys = scene.splat_keys(self.folder) if has_splats else scene.point_numbers(self.folder)
         self.kind = "splats" if has_splats else "points"
-        job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *locations.segmenter_options())
+        self.segmenter = locations.segmenter()
+        options = locations.segmenter_options(self.segmenter)
+        job = locations.backend_job("", "point", self.folder, "point", str(self.folder), *options)
         self.process = BackendProcess(job.command, job.cwd, job.environment, in_background=False)
         self.ready, self.progress, self.message, self.failure = False, 0.0, "Starting", ""
         self.problem, self.said, self.said_passes = "", "", False
@@ -175,13 +177,13 @@ _keeps_colors = False
 
 
 def start(root: bpy.types.Collection) -> None:
-    """Start the process for a reconstruction, unless it runs.
+    """Start the process for a reconstruction, unless it runs with the segmentation model of the preferences.
 
     Raises:
         InputError: the folder has no splats that can be read, or the process cannot be started.
     """
     global _session
-    if is_active(root):
+    if is_active(root) and segmenter(root) == locations.segmenter():
         return
     stop()
     try:
@@ -248,6 +250,11 @@ def release(folder: Path | None, keeps_colors: bool = False) -> bool:
 def is_active(root: bpy.types.Collection) -> bool:
     """Return whether the process runs for a reconstruction."""
     return _session is not None and _session.root == root.session_uid
+
+
+def segmenter(root: bpy.types.Collection) -> Path | None:
+    """Return the folder of the model that segments a reconstruction's strokes: the one they are shown with, if any."""
+    return _session.segmenter if _session is not None and is_active(root) else locations.segmenter()
 
 
 def state() -> tuple[float, bool]:

@@ -158,7 +158,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
             str(folder),
             "--strokes",
             str(strokes),
-            *locations.segmenter_options(),
+            *locations.segmenter_options(pointing.segmenter(root)),
         )
         # A click then selects the object that it has become.
         marking_tool.leave(context)

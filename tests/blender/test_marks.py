@@ -429,6 +429,24 @@ def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatc
         assert command[command.index("point") + 2 :] == [*options, "--json"]
 
 
+def test_a_model_chosen_while_marking_is_used_from_the_next_stroke_on(root, session, monkeypatch, tmp_path):
+    """Until then, the panel and the separation go by the model that the strokes are shown with."""
+    submitted = []
+    monkeypatch.setattr(background, "submit", lambda job, *_: submitted.append(job) or {"FINISHED"})
+    marks.add_stroke(root, marks.add_object(root).object_id, views(root)[0], [(1, 1)], area=False)
+    own = SimpleNamespace(segmenter=str(tmp_path / "sam2"), backend_python="", reconstructions="")
+    monkeypatch.setattr(locations, "preferences", lambda: own)
+    for is_used in (False, True):
+        assert ("all that sam2 segments" in texts_of(MarkingPanel)) is is_used
+        bpy.ops.objectgs.separate_marked()
+        assert ("--segmenter" in submitted[-1].command) is is_used
+        pointing.start(root)
+        again = pointing._session
+        assert again is not session and again.process.command[-3:-1] == ["--segmenter", own.segmenter]
+    pointing.start(root)
+    assert pointing._session is again
+
+
 PROPOSED = {
     "everything": True,
     "strokes": [

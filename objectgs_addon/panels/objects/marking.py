@@ -7,7 +7,6 @@ from typing import Any
 
 import bpy
 
-from ...environment import locations
 from ...picking import marks
 from ...running import background, pointing
 from ...running.job_display import write
@@ -77,7 +76,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             self._draw_state(layout, root)
             if folder_trust.state_of(root).trained and (hidden := _why_hidden(context)):
                 write(layout, hidden, "HIDE_ON")
-        if (model := locations.segmenter()) is not None:
+        if (model := pointing.segmenter(root)) is not None:
             write(layout, f"A stroke marks all that {model.name} segments by it.", "INFO")
         if is_active or not properties.objects:
             _draw_list(layout, properties)
