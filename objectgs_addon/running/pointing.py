@@ -48,6 +48,7 @@ class _Session:
         self.is_proposing = False
         self.proposed_to_replace: dict[str, Any] = {}
         self._asked_strokes: list[dict[str, Any]] = []
+        self._asked_everything: bool | None = None
         self._answered_strokes: list[dict[str, Any]] = []
         self.taken: tuple[int, int, float] | None = None
         self.wanted_detail: float | None = None
@@ -65,21 +66,25 @@ class _Session:
         if not self.ready:
             return
         self.is_proposing = False
+        self._asked_strokes, self._asked_everything = content["strokes"], content["everything"]
         if not content["strokes"]:
             self.objects, self.classes = np.zeros(1, np.int64), np.zeros(len(self.keys), np.int64)
             self.asked = self.answered = self.asked + 1
             self._answered_strokes = []
             return
         self.asked += 1
-        self._asked_strokes = content["strokes"]
         self.process.send(json.dumps({"request": self.asked, **content}), replaces=True)
+
+    def has_asked(self, content: dict[str, Any]) -> bool:
+        """Return whether the latest request has these strokes."""
+        return self._asked_everything == content["everything"] and self._asked_strokes == content["strokes"]
 
     def propose(self, detail: float) -> None:
         """Ask for objects without strokes, now or as soon as the process is ready; detail: how finely to divide."""
         self.wanted_detail = None if self.ready else detail
         if self.ready:
             self.asked += 1
-            self.is_proposing = True
+            self.is_proposing, self._asked_everything = True, None
             content = {"request": self.asked, "propose": True, "detail": detail}
             self.process.send(json.dumps(content), replaces=True)
 
@@ -278,12 +283,15 @@ def share_of_splats() -> dict[int, int]:
 
 
 def refresh(root: bpy.types.Collection) -> None:
-    """Ask for the objects of changed strokes, which may settle a problem of earlier ones."""
+    """Ask for the objects of strokes if they have changed, which may settle a problem of earlier ones."""
     if _session is not None and _session.root == root.session_uid:
         content = marks.content(root)
         is_proposing = _session.is_proposing or _session.wanted_detail is not None
         if is_proposing and content == _session.proposed_to_replace:
             # What was undone or set was something else.
+            return
+        if _session.has_asked(content):
+            show()  # An undo may have replaced meshes.
             return
         if _session.said_passes:
             _session.say("")

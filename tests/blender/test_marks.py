@@ -522,6 +522,22 @@ def test_marks_and_suggestions_do_not_cancel_each_other_silently(root, session, 
     assert not session.is_proposing and "Suggest Objects was canceled" in told[-1] == session.said
 
 
+def test_an_undo_of_something_else_asks_for_nothing(root, session):
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    item = marks.add_object(root)
+    marks.add_stroke(root, item.object_id, views(root)[0], [(1, 1)], area=False)
+    session.say("Vase took 12 % of Box", passes=True)
+    item.name = "can"
+    pointing.refresh(root)
+    assert len(session.process.sent) == 1 and session.said
+    root.objectgs.everything = True
+    assert len(session.process.sent) == 2 and not session.said
+    session.propose(0.5)
+    session.take({"type": "answer", "request": session.asked, "proposed": {"strokes": [], "everything": True}})
+    pointing.refresh(root)
+    assert len(session.process.sent) == 4, "the strokes may not have been answered before the suggestion"
+
+
 def test_strokes_during_the_preparation_cancel_a_suggestion(root, session, monkeypatch):
     told = []
     monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
