@@ -135,8 +135,9 @@ object of its own; Blender merges marked objects so. Object 0 is what belongs to
 object, like all that is far from the strokes, unless the file has "everything": true.
 
 With --segmenter, each stroke stands for all that SAM, SAM 2.1 or EdgeTAM segments by it,
-so that a few strokes tell more. FOLDER is a checkpoint of the package transformers:
-config.json and weights. Nothing is downloaded.
+so that a few strokes tell more; those with "exact": true, as `propose` writes them, are
+left as they are. FOLDER is a checkpoint of the package transformers: config.json and
+weights. Nothing is downloaded.
 """
 
 CLEAN_LABELS = """\

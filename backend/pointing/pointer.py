@@ -148,7 +148,7 @@ class Pointer:
             view = self._views.reference(index)
             for object_id, pixels in zip(*np.unique(shown[shown > 0], return_counts=True), strict=True):
                 if pixels >= _FEWEST_PIXELS:
-                    stroke = Stroke(int(object_id), view, stroke_through(shown == object_id))
+                    stroke = Stroke(int(object_id), view, stroke_through(shown == object_id), exact=True)
                     best.setdefault(int(object_id), []).append((int(pixels), stroke))
         strokes = tuple(
             stroke
@@ -227,7 +227,7 @@ class Pointer:
 
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""
-        if self._segment is None:
+        if self._segment is None or stroke.exact:
             return ()
         return tuple(other for other in strokes if other.view == stroke.view and other.object != stroke.object)
 

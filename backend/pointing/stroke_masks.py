@@ -37,7 +37,7 @@ def stroke_pixels(
     """Return the pixels (H, W) bool that a stroke stands for, and whether they are the mask of a model.
 
     They are the mask that a model finds, without its border, if that contains most of the stroke, no stroke of another
-    object, and less than half of the picture; otherwise those that the stroke covers.
+    object, and less than half of the picture; otherwise, and for exact strokes, those that the stroke covers.
 
     Args:
         stroke: the stroke.
@@ -47,7 +47,7 @@ def stroke_pixels(
         picture: returns the picture, (H, W, 3) uint8.
     """
     own = stroke.pixels(*size)
-    if segment is None:
+    if segment is None or stroke.exact:
         return own, False
     points = [points_on(stroke, size, _POINTS), *(points_on(other, size, _POINTS_OF_OTHERS) for other in others)]
     on_others = np.concatenate([np.zeros((0, 2)), *points[1:]])[-_MOST_OF_OTHERS:]

@@ -49,6 +49,7 @@ class Stroke:
             left corner; one point is a click.
         area: whether everything inside of the line is meant, which is closed then.
         part: number of the object's part that it is on. Parts were objects once, and merging these left each as it was.
+        exact: whether the stroke stands for no more than it covers, even if there is a segmentation model.
     """
 
     object: int
@@ -56,6 +57,7 @@ class Stroke:
     points: tuple[tuple[float, float], ...]
     area: bool = False
     part: int = 0
+    exact: bool = False
 
     def pixels(self, width: int, height: int) -> np.ndarray:
         """Return the pixels that the stroke covers in an image of this size, (height, width) bool."""
@@ -105,10 +107,13 @@ def content_of(strokes: Strokes) -> dict[str, Any]:
         "objects": {str(object_id): name for object_id, name in strokes.names.items()},
         "everything": strokes.everything,
         "strokes": [
-            {"object": stroke.object, **_place(stroke.view), "points": [list(point) for point in stroke.points]}
+            {
+                "object": stroke.object, **_place(stroke.view), "points": [list(point) for point in stroke.points],
+                **({"exact": True} if stroke.exact else {}),
+            }
             for stroke in strokes.strokes
         ],
-    }
+    }  # fmt: skip
 
 
 def _place(view: str | Viewpoint) -> dict[str, Any]:
@@ -124,8 +129,8 @@ def read_strokes(path: Path, views: Sequence[str]) -> Strokes:
 
     The file is a JSON object. `strokes` is a list of objects with `object` (an ID), `points` (a list of [x, y],
     fractions of the image's width and height) and either `view` (the name of a photo, undistorted) or `camera` (with
-    `viewmat` (4, 4), `intrinsics` fx, fy, cx and cy, `width` and `height`); `area` may be true, and `part` the
-    number of a part of the object. `objects` may name the IDs, and `everything` may be true.
+    `viewmat` (4, 4), `intrinsics` fx, fy, cx and cy, `width` and `height`); `area` and `exact` may be true, and `part`
+    the number of a part of the object. `objects` may name the IDs, and `everything` may be true.
 
     Args:
         path: the file.
@@ -160,21 +165,22 @@ def _stroke(entry: Any, where: str, views: set[str]) -> Stroke:
     if not isinstance(entry, Mapping):
         raise InputError(f"{where} is no JSON object; it needs `object`, `points`, and `view` or `camera`.")
     object_id, points, area = entry.get("object"), entry.get("points"), entry.get("area", False)
-    part = entry.get("part", 0)
+    part, exact = entry.get("part", 0), entry.get("exact", False)
     if not _is_number(object_id, LARGEST_ID):
         raise InputError(f"{where} has the object {object_id!r}; an ID is a whole number from 0 to {LARGEST_ID}.")
     if not _is_number(part, PARTS - 1):
         raise InputError(f"{where} has the part {part!r}; it must be a whole number from 0 to {PARTS - 1}.")
     if not isinstance(points, list) or not points or not all(map(_is_point, points)):
         raise InputError(f"{where} needs `points`, a list of [x, y] with fractions from 0 to 1 of the image's size.")
-    if not isinstance(area, bool):
-        raise InputError(f"{where} has {area!r} as `area`; it must be true or false.")
+    for key, value in (("area", area), ("exact", exact)):
+        if not isinstance(value, bool):
+            raise InputError(f"{where} has {value!r} as `{key}`; it must be true or false.")
     seen_from = _viewpoint(entry["camera"], where) if "camera" in entry else entry.get("view")
     if isinstance(seen_from, str) and seen_from not in views:
         raise InputError(f"{where} is on the photo {seen_from!r}, which the capture lacks; name one of its photos.")
     if not isinstance(seen_from, str | Viewpoint):
         raise InputError(f"{where} needs `view`, the name of a photo, or `camera`.")
-    return Stroke(object_id, seen_from, tuple((float(x), float(y)) for x, y in points), area, part)
+    return Stroke(object_id, seen_from, tuple((float(x), float(y)) for x, y in points), area, part, exact)
 
 
 def _viewpoint(camera: Any, where: str) -> Viewpoint:

@@ -130,9 +130,7 @@ def set_proposed(root: bpy.types.Collection, proposed: dict[str, Any]) -> None:
         KeyError, TypeError, ValueError: it is not valid.
     """
     properties = root.objectgs
-    strokes = [
-        {"object": int(each["object"]), **_place_of(each), "points": each["points"]} for each in proposed["strokes"]
-    ]
+    strokes = [_kept(each) for each in proposed["strokes"]]
     taken = {item.object_id for item in properties.objects}
     free = (number for number in itertools.count(1) if number not in taken)
     ids = {number: next(free) for number in sorted({stroke["object"] for stroke in strokes})}
@@ -151,11 +149,7 @@ def restore(root: bpy.types.Collection, folder: Path) -> None:
         return
     with contextlib.suppress(InputError, KeyError, TypeError, ValueError, AttributeError):
         kept = read_json(path)
-        strokes = [
-            {**{key: each[key] for key in ("part", "area") if key in each}, **_place_of(each),
-             "object": int(each["object"]), "points": each["points"]}
-            for each in kept["strokes"]
-        ]  # fmt: skip
+        strokes = [_kept(each) for each in kept["strokes"]]
         ids = sorted({stroke["object"] for stroke in strokes} - {NOTHING})
         names = {object_id: str(kept["objects"].get(str(object_id)) or f"Object {object_id}") for object_id in ids}
         everything = bool(kept["everything"])
@@ -165,9 +159,11 @@ def restore(root: bpy.types.Collection, folder: Path) -> None:
         _store(root, strokes)
 
 
-def _place_of(stroke: dict[str, Any]) -> dict[str, Any]:
-    """Return the entry of a stroke that says where it was drawn: in a photo, or through a camera."""
-    return {"view": str(stroke["view"])} if "view" in stroke else {"camera": dict(stroke["camera"])}
+def _kept(stroke: dict[str, Any]) -> dict[str, Any]:
+    """Return what is kept of a stroke in a file; raises KeyError, TypeError or ValueError if it is not valid."""
+    place = {"view": str(stroke["view"])} if "view" in stroke else {"camera": dict(stroke["camera"])}
+    other: dict[str, Any] = {key: stroke[key] for key in ("part", "area", "exact") if key in stroke}
+    return {**other, **place, "object": int(stroke["object"]), "points": stroke["points"]}
 
 
 def merge_object(root: bpy.types.Collection, index: int, into: int) -> None:

@@ -35,7 +35,7 @@ from backend.pointing.proposals import find_objects, try_regions
 from backend.pointing.random_walker import best_borders, connected_with, random_walker, rough_walker
 from backend.pointing.splat_graph import IN_FRONT, OF_SPLATS, ON_PLANE, Edges, SplatGraph, contributions
 from backend.pointing.stroke_masks import points_on, stroke_pixels
-from backend.pointing.strokes import Stroke, Strokes, Viewpoint, read_strokes, strokes_of
+from backend.pointing.strokes import Stroke, Strokes, Viewpoint, content_of, read_strokes, strokes_of
 from backend.pointing.views import views_around, views_of_photos
 from backend.raster import Camera, object_ranks, rasterize
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
@@ -84,6 +84,7 @@ def test_strokes_are_read_with_names(tmp_path) -> None:
         ({"strokes": [{**ONE, "object": True}]}, "Stroke 1"),
         ({"strokes": [ONE, {**ONE, "object": 2**32}]}, "Stroke 2"),
         ({"strokes": [{**ONE, "part": -1}]}, "the part -1"),
+        ({"strokes": [{**ONE, "exact": 1}]}, "1 as `exact`"),
         ({"strokes": [{**ONE, "view": "b.png"}]}, "b.png"),
         ({"strokes": [{**ONE, "view": ["a.png"]}]}, "Stroke 1"),
         ({"strokes": [{**ONE, "points": []}]}, "points"),
@@ -740,6 +741,7 @@ def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_comman
     assert result.code == EXIT_DONE and result.events[-1]["objects"] >= 3
     content = json.loads((out / "strokes.json").read_text())
     assert {stroke["view"] for stroke in content["strokes"]} <= set(scene.names)
+    assert all(stroke["exact"] for stroke in content["strokes"])
     assert run_command("label", out, "--strokes", out / "strokes.json").code == EXIT_DONE
     capture = load_capture(scene.folder, tmp_path / "again")
     shown = np.zeros((100, 6))
@@ -915,6 +917,15 @@ def test_bad_masks_leave_the_strokes() -> None:
     thin = np.zeros_like(half)
     thin[49:52, 40:100] = True
     assert np.array_equal(pixels_of(thin)[1], thin), "it has hardly anything but a border"
+
+
+def test_a_model_is_not_asked_for_exact_strokes() -> None:
+    (stroke,) = strokes_of({"strokes": [{**ONE, "exact": True}]}, "the request", ["a.png"]).strokes
+    assert strokes_of(content_of(Strokes((stroke,), {})), "a file", ["a.png"]).strokes == (stroke,)
+    pixels, is_mask = stroke_pixels(
+        stroke, (), (200, 100), lambda *_: pytest.fail("the model was asked"), lambda: pytest.fail("the picture, too")
+    )
+    assert not is_mask and np.array_equal(pixels, stroke.pixels(200, 100))
 
 
 def test_prompts_are_on_strokes_and_inside_areas() -> None:

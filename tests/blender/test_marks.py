@@ -450,8 +450,9 @@ def test_a_model_chosen_while_marking_is_used_from_the_next_stroke_on(root, sess
 PROPOSED = {
     "everything": True,
     "strokes": [
-        *({"object": number, "view": "a.png", "points": [[0.1, 0.2], [0.3, 0.2]]} for number in (1, 2, 2)),
-        {"object": 3, "camera": {"width": 400}, "points": [[0.1, 0.2], [0.3, 0.2]]},
+        *({"object": number, "view": "a.png", "points": [[0.1, 0.2], [0.3, 0.2]], "exact": True}
+          for number in (1, 2, 2)),
+        {"object": 3, "camera": {"width": 400}, "points": [[0.1, 0.2], [0.3, 0.2]], "exact": True},
     ],
 }  # fmt: skip
 
@@ -484,6 +485,7 @@ def test_proposed_objects_replace_the_marked_ones_and_can_be_merged(root, sessio
     bpy.ops.objectgs.merge_marked(into="0")
     parts = [(each["object"], each.get("part", 0)) for each in marks.strokes_of(root)]
     assert parts == [(3, 2), (3, 0), (3, 0), (3, 1)], "what was an object stays a part of its own"
+    assert all(each["exact"] for each in marks.strokes_of(root))
 
 
 def test_marks_stay_if_no_objects_are_proposed(root, session):
