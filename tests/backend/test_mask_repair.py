@@ -1,16 +1,18 @@
 """Repair of masks by all photos together, and the command that gives splats their objects anew."""
 
 import json
+import weakref
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from backend.capture import load_capture
+from backend.commands.objects import clean_labels
 from backend.export import read_splats
 from backend.labels import vote
 from backend.model.draw import draw
-from backend.pointing.mask_repair import contradicted
+from backend.pointing.mask_repair import contradicted, repair_masks
 from backend.shared.errors import EXIT_DONE
 from backend.training.scene import Scene
 from backend.training.state import load_model
@@ -67,7 +69,20 @@ def mask_of(capture, index):
 
 @pytest.mark.parametrize("longest", [1000, 50])
 def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command, monkeypatch, longest) -> None:
-    """Larger images vote in a reduced size."""
+    """Larger images vote in a reduced size. What compares the splats does not take memory from the training."""
+    in_use = []
+
+    def repair(pointer, *arguments):
+        in_use.append(weakref.ref(pointer))
+        return repair_masks(pointer, *arguments)
+
+    def train(*arguments):
+        in_use.append(in_use[0]())
+        train_borders(*arguments)
+
+    train_borders = clean_labels.train_borders
+    monkeypatch.setattr(clean_labels, "repair_masks", repair)
+    monkeypatch.setattr(clean_labels, "train_borders", train)
     monkeypatch.setattr("backend.pointing.splat_graph.LONGEST", longest)
     scene, out = trained
     before = rendered(scene, out)
@@ -75,6 +90,7 @@ def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command, mo
     masks_before = fraction_right(scene, lambda index: mask_of(given, index))
     result = run_command("clean-labels", out, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["steps"] == STEPS * 6 // 5
+    assert in_use[1:] == [None]
     again = load_capture(scene.folder, tmp_path / "again")
     masks_after = fraction_right(scene, lambda index: mask_of(again, index))
     assert masks_before < 0.96 and masks_after > 0.98

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+import weakref
 import zlib
 from itertools import pairwise
 
@@ -20,7 +21,7 @@ from scipy.spatial import cKDTree
 
 from backend.capture import load_capture
 from backend.commands.objects import label
-from backend.commands.objects.pointable import open_pointable
+from backend.commands.objects.pointable import open_pointable, segmentation
 from backend.export.ply import read_splats
 from backend.model.anchors import Anchors
 from backend.model.checkpoint import save_checkpoint
@@ -940,7 +941,7 @@ def test_prompts_are_on_strokes_and_inside_areas() -> None:
     assert all(inside[int(y) - 9 : int(y) + 10, int(x) - 9 : int(x) + 10].all() for x, y in points)
 
 
-def test_label_takes_a_model(unlabeled, tmp_path, run_command) -> None:
+def test_label_takes_a_model_until_the_training(unlabeled, tmp_path, run_command, monkeypatch) -> None:
     scene, out = unlabeled
     strokes = strokes_file(tmp_path, strokes_on(scene, (1,)))
     result = run_command("label", out, "--strokes", strokes, "--segmenter", tmp_path / "none")
@@ -949,5 +950,15 @@ def test_label_takes_a_model(unlabeled, tmp_path, run_command) -> None:
     pytest.importorskip("transformers")
     model = tmp_path / "model"
     write_small_model(model, "sam2")
+    in_use = []
+
+    def opened(*arguments):
+        found = segmentation(*arguments)
+        in_use.append(weakref.ref(found))
+        return found
+
+    monkeypatch.setattr(label, "segmentation", opened)
+    monkeypatch.setattr(label, "train_borders", lambda *_: in_use.append(in_use[0]()))
     result = run_command("label", out, "--strokes", strokes, "--segmenter", model)
     assert result.code == EXIT_DONE and (scene.folder / "masks").is_dir(), result.err
+    assert in_use[1:] == [None]

@@ -94,6 +94,7 @@ def _clean_labels(options: argparse.Namespace, reporter: StoppingReporter) -> No
         if anew.agreement < _CONSISTENT:
             reporter.status(f"Masks agree on the ID of {anew.agreement:.0%} of what they show; IDs are found anew")
         repair = repair_masks(pointer, anew.masks, zero_is_known, reporter.progress)
+        del pointer  # The training needs its memory.
         reporter.begin(_MASKS, f"Writing masks of {len(capture)} photos")
         changed, moved = _changed(capture, given, repair), _moved(source, opened.splats, capture, repair)
         is_same = anew.agreement >= _CONSISTENT

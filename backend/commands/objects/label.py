@@ -92,7 +92,8 @@ def _label_trained(
         ids = _solve(pointer, strokes, reporter)
         reporter.begin(_MASKS, f"Making masks of {len(capture.train_indices)} photos")
         _write_masks(trained, pointer, ids, strokes, options, reporter)
-    trainer = begin_border_training(trained, pointer.splats.source.cpu().numpy(), ids, options, reporter)
+    del pointer, segment  # The training needs their memory.
+    trainer = begin_border_training(trained, opened.splats.source.cpu().numpy(), ids, options, reporter)
     train_borders(trained, trainer, reporter)
     reporter.done(
         masks=str(capture.folder / "masks"), objects=_number_of(strokes), views=len(capture.train_indices),
