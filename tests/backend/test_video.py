@@ -14,7 +14,7 @@ from PIL import Image, ImageCms, ImageFilter
 from backend.capture.files import read_mask
 from backend.sfm.sources import masks, motion, photo_files, photos, video
 from backend.shared.color import hdr
-from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
+from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, Cancelled, InputError
 from backend.shared.events import Reporter
 from backend.shared.stopping import StoppingReporter, StopRequest
 
@@ -351,6 +351,43 @@ def test_photos_that_changed_are_copied_again(tmp_path):
     assert not (capture / "sfm" / "database.db").exists()
     for name in ("a.jpg", "b.jpg"):
         assert (capture / "images" / name).read_bytes() == (folder / name).read_bytes()
+
+
+@pytest.mark.parametrize("error", [Cancelled, KeyboardInterrupt])
+def test_photos_that_changed_after_a_stop_among_them_are_copied_again(tmp_path, error):
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    folder.mkdir()
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        heic(folder / name)
+
+    class Stops(Reporter):
+        def progress(self, done, *_, **_fields):
+            if done == 2:
+                raise error
+
+    with pytest.raises(error):
+        photos.take_photos([folder], capture, None, StoppingReporter(Stops(), StopRequest()))
+    kept = (capture / "images" / "b.jpg").stat().st_mtime_ns
+    Image.fromarray(texture(5)[:120, :160].astype(np.uint8)).save(folder / "a.jpg")
+    photos.take_photos([folder], capture, None, reporter())
+    assert (capture / "images" / "a.jpg").read_bytes() == (folder / "a.jpg").read_bytes()
+    is_kept = (capture / "images" / "b.jpg").stat().st_mtime_ns == kept
+    assert is_kept == (error is Cancelled), "after a kill, it may be of any state"
+
+
+def test_masks_that_changed_after_a_damaged_one_are_copied_again(tmp_path):
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    (folder / "masks").mkdir(parents=True)
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name)
+    Image.new("L", (160, 120), 1).save(folder / "masks" / "a.png")
+    (folder / "masks" / "b.jpg").write_bytes(b"damaged")
+    with pytest.raises(InputError):
+        photos.take_photos([folder], capture, None, reporter())
+    Image.new("L", (160, 120), 2).save(folder / "masks" / "a.png")
+    Image.new("L", (160, 120), 255).save(folder / "masks" / "b.jpg")
+    photos.take_photos([folder], capture, None, reporter())
+    assert read_mask(capture / "masks" / "a.png").max() == 2
 
 
 def test_copies_are_used_when_the_photos_are_gone(tmp_path):

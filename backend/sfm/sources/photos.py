@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from ...capture.files import Files, image_size, mask_names, mask_size, same_shape
 from ...capture.mask_sources import MaskFiles
-from ...shared.errors import InputError
+from ...shared.errors import Cancelled, InputError
 from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.photos_source import NOT_OF_USERS, PHOTOS, VIDEOS, WORK, natural_order
@@ -125,7 +125,11 @@ def take_photos(
     taken_names: set[str] = set()
     stamps = Stamps(capture)
     for number, path in enumerate(files):
-        reporter.progress(number, len(files))
+        try:
+            reporter.progress(number, len(files))
+        except Cancelled:
+            stamps.write()
+            raise
         relative = path.relative_to(base)
         name = relative.as_posix()
         try:
@@ -149,7 +153,9 @@ def take_photos(
             if is_changed:
                 database.remove_all(capture / WORK)
             if not in_place:
-                copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again=is_changed)
+                # Without a stamp, a copy is of an unknown state: the run that made it was killed.
+                again = is_changed or not stamps.is_known(name)
+                copied = photo_files.copy_photo(path, capture / IMAGES / copy, turn, again)
                 relative = copied.relative_to(capture / IMAGES)
                 if is_raw:
                     camera = photo_files.camera_of(copied, False)
@@ -174,14 +180,19 @@ def take_photos(
     if len(photos) < 2:
         why = next(iter(unreadable.values()), "a single photo has no pose.")
         raise InputError(f"Of the photos in {base}, {len(photos)} can be read; {why}")
-    if source.is_dir() and (base != source or (source / MASKS).is_dir()):
-        masks = MaskFiles(source / MASKS, names, base)
-        if not in_place:
-            copy_rest(source, masks, names, capture, stamps)
-        write_masks(masks, masks.lossy, names, capture, stamps)
-    if are_beside:
-        masks = MaskFiles(base, names, base)
-        write_masks(masks, masks.photos, names, capture, stamps)
+    try:
+        if source.is_dir() and (base != source or (source / MASKS).is_dir()):
+            masks = MaskFiles(source / MASKS, names, base)
+            if not in_place:
+                copy_rest(source, masks, names, capture, stamps)
+            write_masks(masks, masks.lossy, names, capture, stamps)
+        if are_beside:
+            masks = MaskFiles(base, names, base)
+            write_masks(masks, masks.photos, names, capture, stamps)
+    except InputError:
+        # Of the masks before the one that cannot be read.
+        stamps.write()
+        raise
     if not from_copies and not in_place:
         warn_of_gone(names.values(), capture, stamps, reporter)
     stamps.write()

@@ -29,6 +29,10 @@ class Stamps:
         self._now[name] = [status.st_size, status.st_mtime_ns, *details]
         return name in self._known and self._known[name] != self._now[name]
 
+    def is_known(self, name: str) -> bool:
+        """Return whether a file was asked for in an earlier run, so that its copy is whole and of a known state."""
+        return name in self._known
+
     def masks_not_asked_for(self) -> list[str]:
         """Return the paths in the capture of masks whose originals were not asked for, as they are gone."""
         gone = sorted(name for name in self._known.keys() - self._now.keys() if name.startswith(f"../{MASKS}/"))
