@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
+from dataclasses import replace
 from itertools import combinations
 from pathlib import PureWindowsPath
 
@@ -25,7 +26,7 @@ from backend.sfm import agreement, check, database, pairs, stages, worker
 from backend.sfm.background import stands_still
 from backend.sfm.former_frame import Pose, similarity
 from backend.sfm.learned.photos import add_photos
-from backend.sfm.model import centers_of
+from backend.sfm.model import centers_of, former_on_error
 from backend.sfm.sources.photos import Photo
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Cancelled, InputError
 from backend.shared.events import Reporter
@@ -196,6 +197,24 @@ def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkey
     assert left_out() == (["photo 7.png"] if is_first else [])
     assert {path: path.read_bytes() for path in (out / "sparse").rglob("*") if path.is_file()} == before
     assert (out / "sfm" / "sfm.json").read_bytes() == report
+
+
+def test_stop_after_a_killed_run_leaves_the_model_before_both(made, photos, tmp_path):
+    out, wanted = shutil.copytree(made, tmp_path / "capture"), photos_source.PhotosSource([photos])
+    before, source = (path.read_bytes() for path in (out / "sparse/0/images.bin", out / "sfm/source.json"))
+    killed = former_on_error(out)
+    killed.__enter__()
+    (out / "sparse/0/images.bin").write_bytes(b"half-made")
+    photos_source.write_source(out, replace(wanted, leave_out=["photo 7.png"]))
+    assert not source_files.has_poses_of(out, wanted)
+    with pytest.raises(Cancelled), former_on_error(out):
+        raise Cancelled("Stopped")
+    assert (out / "sparse/0/images.bin").read_bytes() == before and (out / "sfm/source.json").read_bytes() == source
+    assert source_files.has_poses_of(out, wanted)
+    assert {path.name for path in (out / "sparse/0").iterdir()} == {path.name for path in (made / "sparse/0").iterdir()}
+    with former_on_error(out):
+        assert not source_files.has_poses_of(out, wanted)
+    assert source_files.has_poses_of(out, wanted)
 
 
 @pytest.mark.long

@@ -21,6 +21,8 @@ WORK = "sfm"
 REPORT = "sfm.json"
 """File there about the poses that were found."""
 SOURCE = "source.json"
+FORMER = "former"
+"""Folder there with the model and `SOURCE` of the earlier run, until the present one has ended."""
 SPARSE = Path("sparse", "0")
 """Folder in the capture for the poses and points."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..formats.json_file import read_json
 from ..formats.photos_source import (
+    FORMER,
     LISTS,
     NOT_OF_USERS,
     PHOTOS,
@@ -21,6 +22,7 @@ from ..formats.photos_source import (
     has_poses,
     read_source,
 )
+from ..formats.regular_file import is_folder
 from ..reconstruction.folder import Reconstruction
 
 _COUNTED = PHOTOS | VIDEOS | {".npy", ".npz"}
@@ -30,10 +32,10 @@ _COUNTED = PHOTOS | VIDEOS | {".npy", ".npz"}
 def has_poses_of(capture: Path, wanted: PhotosSource) -> bool:
     """Return whether a capture has poses that were computed as wanted, of the same files.
 
-    Photos to leave out, the set and the networks may be others.
+    Photos to leave out, the set and the networks may be others. Poses of a run that was killed do not count.
     """
     stored = read_source(capture)
-    if stored is None or not has_poses(capture):
+    if stored is None or not has_poses(capture) or is_folder(capture / WORK / FORMER):
         return False
     features = stored.features if wanted.features == "auto" else wanted.features
     own = replace(wanted, features=features, leave_out=stored.leave_out, set=stored.set, matcher=stored.matcher)
