@@ -32,17 +32,23 @@ def tie_rigs(model: pycolmap.Reconstruction) -> list[list[str]]:
     rigs = _find(model)
     if not rigs:
         return []
+    # COLMAP takes all images whose names begin with a folder, also those in folders inside.
+    names = {number: image.name for number, image in model.images.items()}
+    flat = {folder: f"{number}/" for number, folder in enumerate({_folder(name) for name in names.values()})}
     configs = []
     for folders in rigs:
         config, cameras = pycolmap.RigConfig(), []
         for number, folder in enumerate(folders):
             camera = pycolmap.RigConfigCamera()
-            camera.image_prefix, camera.ref_sensor = folder, number == 0
+            camera.image_prefix, camera.ref_sensor = flat[folder], number == 0
             cameras.append(camera)
         config.cameras = cameras
         configs.append(config)
-    # COLMAP takes the names and cameras of the images from a database.
-    with tempfile.TemporaryDirectory() as folder, pycolmap.Database.open(Path(folder) / "rigs.db") as database:
+    for number, name in names.items():
+        folder = _folder(name)
+        model.images[number].name = flat[folder] + name[len(folder) :]
+    # It takes the names and cameras of the images from a database.
+    with tempfile.TemporaryDirectory() as made, pycolmap.Database.open(Path(made) / "rigs.db") as database:
         for camera in model.cameras.values():
             database.write_camera(camera, True)
         for rig in model.rigs.values():
@@ -52,6 +58,8 @@ def tie_rigs(model: pycolmap.Reconstruction) -> list[list[str]]:
         for image in model.images.values():
             database.write_image(image, True)
         pycolmap.apply_rig_config(configs, database, model)
+    for number, name in names.items():
+        model.images[number].name = name
     return rigs
 
 

@@ -9,6 +9,7 @@ from PIL import Image
 
 from backend.cli import main as command_line
 from backend.sfm import rig
+from backend.sfm.model import centers_of
 from backend.shared.errors import EXIT_DONE
 
 from .command_result import assert_rejected
@@ -115,6 +116,18 @@ def test_photo_without_pose_gets_that_of_its_rig(pairs):
     assert rig.tie_rigs(model) == [["left/", "right/"]] == rig.rigs_of(model)
     (found,) = (image for image in model.images.values() if image.name == "right/3.png")
     assert np.abs(found.cam_from_world().matrix() - before).max() < 0.05
+
+
+@pytest.mark.parametrize("second", ["right/", "left/right/"])
+def test_photos_in_a_folder_inside_one_of_a_rig_are_not_of_it(pairs, second):
+    model = pycolmap.Reconstruction(pairs / "sfm" / "chosen")
+    for image in model.images.values():
+        image.name = image.name.replace("right/4.png", "left/close/4.png").replace("right/", second)
+    before = centers_of(model)
+    assert rig.tie_rigs(model) == [["left/", second]] == rig.rigs_of(model)
+    after = centers_of(model)
+    assert after.keys() == before.keys() and "left/close/4.png" in after
+    assert after["left/close/4.png"] == pytest.approx(before["left/close/4.png"])
 
 
 def test_cameras_that_move_on_their_own_are_no_rig(pairs):
