@@ -588,7 +588,11 @@ def test_cameras_are_others_if_photos_share_them_in_another_way():
     assert differ(groups("ab", "c"), groups("abc")) and differ(groups("abc"), groups("ab", "c"))
     known = {"model": "PINHOLE", "params": []}
     assert differ(groups("ab", lens=known), groups("ab")), "the lens of a calibration is forgotten"
-    assert not differ(groups("ab"), groups("ab", lens=known))
+    assert not differ(groups("ab"), groups("ab", lens=known)) and not differ(
+        groups("ab", lens=known), groups("ab", lens=dict(known))
+    )
+    other = {**known, "params": [300.0]}
+    assert differ(groups("ab", lens=known), groups("ab", lens=other)), "matches were verified with the former lens"
 
 
 def test_databases_in_shared_folders_can_be_named():

@@ -379,14 +379,14 @@ def _groups(photos: list[Photo], images: Path, made_from: PhotosSource) -> list[
 
 
 def _have_other_cameras(before: list[dict[str, Any]], now: list[dict[str, Any]]) -> bool:
-    """Return whether photos share cameras in another way than in an earlier run, or have lost a known lens."""
+    """Return whether photos share cameras in another way than in an earlier run, or a known lens has changed."""
     common = {name for group in before for name in group["names"]} & {name for group in now for name in group["names"]}
 
-    def shared(groups: list[dict[str, Any]]) -> dict[frozenset[str], bool]:
-        return {frozenset(common.intersection(each["names"])): each["camera"] is not None for each in groups}
+    def shared(groups: list[dict[str, Any]]) -> dict[frozenset[str], dict[str, Any] | None]:
+        return {frozenset(common.intersection(each["names"])): each["camera"] for each in groups}
 
     earlier, later = shared(before), shared(now)
-    return any(earlier.get(names) is None or earlier[names] > is_known for names, is_known in later.items() if names)
+    return any(names not in earlier or earlier[names] not in (None, lens) for names, lens in later.items() if names)
 
 
 def _tell(report: dict[str, Any], capture: Path, reporter: StoppingReporter) -> None:
