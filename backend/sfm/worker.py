@@ -77,20 +77,27 @@ def extract(database: str, images: str, groups: str, masks: str = "") -> None:
     """
     pycolmap.Database.open(database).close()
     restore_names(Path(database))
-    for group in _read_groups(groups):
+    listed = _read_groups(groups)
+    shared = [group.names for group in listed if len(group.names) > 1]
+    # COLMAP's threads take a photo each, so those with a camera of their own are given to it at once.
+    alone = [group.names[0] for group in listed if len(group.names) == 1]
+    for names in [*shared, alone] if alone else shared:
+        is_shared = names is not alone
         reader = pycolmap.ImageReaderOptions()
         if masks:
             reader.mask_path = masks
-        reader.existing_camera_id = camera_of(Path(database), group.names)
+        if is_shared:
+            reader.existing_camera_id = camera_of(Path(database), names)
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, _threads
         options.max_image_size = LONGEST_SIDE
         options.sift.max_num_features = MOST_FEATURES
         options.sift.peak_threshold = _FAINT
         pycolmap.extract_features(
-            database, images, image_names=group.names, camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader, extraction_options=options,
+            database, images, image_names=names, reader_options=reader, extraction_options=options,
+            camera_mode=pycolmap.CameraMode.SINGLE if is_shared else pycolmap.CameraMode.PER_IMAGE,
         )  # fmt: skip
+    for group in listed:
         _calibrate(database, group)
 
 

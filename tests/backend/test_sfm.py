@@ -166,6 +166,28 @@ def test_photos_share_a_camera_after_a_stop_among_them(photos, tmp_path):
         assert stored.num_images() == 3 and stored.num_cameras() == stored.num_rigs() == 1
 
 
+def test_photos_with_a_camera_each_are_given_to_the_threads_at_once(photos, tmp_path, monkeypatch):
+    path, listed, calls = tmp_path / database.NAME, tmp_path / "groups.json", []
+    names = sorted(path.name for path in (photos / "images").iterdir())[:5]
+    real = pycolmap.extract_features
+
+    def counted(*arguments, image_names, **options):
+        calls.append(image_names)
+        real(*arguments, image_names=image_names, **options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", counted)
+    lens = {"model": "SIMPLE_PINHOLE", "params": [300.0, WIDTH / 2, HEIGHT / 2]}
+    groups = [([names[0]], lens), (names[1:3], None), ([names[3]], None), ([names[4]], None)]
+    listed.write_text(json.dumps([{"names": own, "camera": camera} for own, camera in groups]))
+    worker.extract(str(path), str(photos / "images"), str(listed))
+    assert calls == [names[1:3], [names[0], *names[3:]]]
+    with pycolmap.Database.open(path) as stored:
+        cameras = {image.name: image.camera_id for image in stored.read_all_images()}
+        assert stored.num_cameras() == len(set(cameras.values())) == 4 and cameras[names[1]] == cameras[names[2]]
+        known = {name: stored.read_camera(number).has_prior_focal_length for name, number in cameras.items()}
+    assert [name for name in names if known[name]] == names[:1]
+
+
 def test_killed_mapper_leaves_the_earlier_model(made, photos, tmp_path, monkeypatch, run_command):
     capture = shutil.copytree(made, tmp_path / "capture")
     before = (capture / "sparse" / "0" / "images.bin").read_bytes()
