@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path, PurePath
 
@@ -19,8 +19,8 @@ POSITIONS = "positions"
 FEWEST_INLIERS = 15
 """Number of matches in agreement from which on COLMAP takes two photos to show the same."""
 
-_INSTEAD_OF_SPACE = "\ue020"
-"""A character for private use, which names in COLMAP's lists of pairs have for spaces."""
+_IN_LISTS = {" ": "\ue020", "#": "\ue023"}
+"""Characters for private use that names in COLMAP's lists of pairs have for spaces, and for what begins a comment."""
 _UNDEFINED = -1
 """COLMAP's type of descriptors that it does not know."""
 _MOST_IMAGES = 2**31 - 1
@@ -62,21 +62,23 @@ def remove_on_objects(work: Path) -> None:
 
 def write_pairs(path: Path, pairs: Iterable[tuple[str, str]]) -> None:
     """Write pairs of names as one of COLMAP's lists; the database needs `listed_names` for it."""
-    lines = (" ".join(name.replace(" ", _INSTEAD_OF_SPACE) for name in pair) + "\n" for pair in pairs)
+    table = str.maketrans(_IN_LISTS)
+    lines = (" ".join(name.translate(table) for name in pair) + "\n" for pair in pairs)
     write_atomic(path, "".join(lines).encode())
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:
     """Read a list that `write_pairs` has written."""
+    table = str.maketrans({new: old for old, new in _IN_LISTS.items()})
     lines = path.read_text(encoding="utf-8").split("\n")[:-1]
     split = (line.split(" ") for line in lines)
-    return [(first.replace(_INSTEAD_OF_SPACE, " "), second.replace(_INSTEAD_OF_SPACE, " ")) for first, second in split]
+    return [(first.translate(table), second.translate(table)) for first, second in split]
 
 
 @contextmanager
 def listed_names(path: Path) -> Iterator[None]:
     """Give the photos in the database the names that are in lists; call `restore_names` first if this was killed."""
-    _rename(path, " ", _INSTEAD_OF_SPACE)
+    _rename(path, _IN_LISTS)
     try:
         yield
     finally:
@@ -86,12 +88,13 @@ def listed_names(path: Path) -> Iterator[None]:
 def restore_names(path: Path) -> None:
     """Give the photos in the database their own names, if it exists."""
     if path.exists():
-        _rename(path, _INSTEAD_OF_SPACE, " ")
+        _rename(path, {new: old for old, new in _IN_LISTS.items()})
 
 
-def _rename(path: Path, old: str, new: str) -> None:
+def _rename(path: Path, instead: Mapping[str, str]) -> None:
     with closing(sqlite3.connect(path, timeout=30.0)) as database, database:
-        database.execute("UPDATE images SET name = replace(name, ?, ?) WHERE instr(name, ?)", (old, new, old))
+        for old, new in instead.items():
+            database.execute("UPDATE images SET name = replace(name, ?, ?) WHERE instr(name, ?)", (old, new, old))
 
 
 def count_features(path: Path) -> int:

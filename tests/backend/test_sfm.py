@@ -569,6 +569,20 @@ def test_pairs_of_photos_with_spaces_in_their_names_are_matched(made, photos, tm
     assert len(database.verified_pairs(path, posed_photos(out))) >= VIEWS - 1
 
 
+def test_pairs_of_photos_whose_names_begin_as_a_comment_are_matched(made, tmp_path):
+    path, listed = tmp_path / database.NAME, tmp_path / "pairs.txt"
+    shutil.copy(made / "sfm" / database.NAME, path)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM matches")
+        connection.execute("DELETE FROM two_view_geometries")
+        connection.execute("UPDATE images SET name = replace(name, 'photo', '#')")
+    chosen = [("# 1.png", "# 2.png"), ("# 2.png", "# 3.png")]
+    database.write_pairs(listed, chosen)
+    assert database.read_pairs(listed) == chosen
+    worker.match(str(path), str(listed))
+    assert database.count_pairs(path) == 2 and "# 1.png" in database.image_ids(path)
+
+
 def test_photos_can_be_given_in_a_list(photos, tmp_path, run_command, monkeypatch):
     """Where they are too many for a command line."""
     given, found = sorted((photos / "images").iterdir()), []
