@@ -543,6 +543,8 @@ def test_videos_of_one_name_have_folders_of_their_own(tmp_path):
     taken = photos.take_photos([folder], tmp_path / "capture", 5, reporter())
     assert {photo.name.split("/")[0] for photo in taken.photos} == {"a.mp4", "A.mov"} and len(taken.photos) == 10
     assert all((tmp_path / "capture" / "images" / photo.name).is_file() for photo in taken.photos)
+    assert {photo.size for photo in taken.photos} == {"192x144"}, "they can share a camera"
+    assert len({photo.camera for photo in taken.photos}) == 2, "but do not unless it is asked for"
 
 
 def test_photos_are_turned_as_exif_says(tmp_path):

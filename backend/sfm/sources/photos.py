@@ -172,7 +172,10 @@ def take_photos(
         folder = _readable(Path(folder)).as_posix() if folder else ""
         try:
             taken = _frames_of(path, capture, folder, frames, reporter)
-            photos += [Photo((Path(folder) / name).as_posix(), f"video {folder}", folder) for name in taken]
+            width, height = image_size(capture / IMAGES / folder / taken[0])
+            photos += [
+                Photo((Path(folder) / name).as_posix(), f"video {folder}", f"{width}x{height}") for name in taken
+            ]
         except InputError as error:
             if is_alone:
                 raise
