@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -25,7 +25,7 @@ _RATIO = 0.8
 def choose_pairs(
     path: Path,
     names: Sequence[str],
-    in_order: bool = False,
+    videos: Iterable[Sequence[str]] = (),
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> list[tuple[str, str]] | None:
     """Return the pairs of photos to match; None for all in the database.
@@ -33,7 +33,7 @@ def choose_pairs(
     Args:
         path: the database with the features.
         names: the photos.
-        in_order: whether they are frames of videos, so that neighbors show the same.
+        videos: names of the frames of each video in the order of `names`, so that neighbors show the same.
         progress: called with the number of compared photos, and of all.
 
     Returns:
@@ -55,8 +55,11 @@ def choose_pairs(
         for second in np.argsort(-row, kind="stable")[:NEIGHBORS].tolist():
             if row[second]:
                 chosen.add((min(first, second), max(first, second)))
-        if in_order:
-            chosen.update((first, second) for second in range(first + 1, min(first + 1 + ALONG, len(names))))
+    numbers = {name: number for number, name in enumerate(names)}
+    for video in videos:
+        frames = [numbers[name] for name in video if name in numbers]
+        for place, first in enumerate(frames):
+            chosen.update((first, second) for second in frames[place + 1 : place + 1 + ALONG])
     return [(names[first], names[second]) for first, second in sorted(chosen)]
 
 

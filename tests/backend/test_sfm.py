@@ -526,6 +526,19 @@ def test_pairs_of_large_sets_are_those_that_show_the_same(made, monkeypatch):
     assert all(abs(first - second) <= 2 for first, second in chosen), "neighbors of the ring"
 
 
+def test_frames_of_a_video_are_matched_with_those_that_follow(tmp_path, monkeypatch):
+    """Also beside photos, and if some frames are left out."""
+    names = [f"{number}.png" for number in range(12)]
+    for name in names:
+        Image.new("RGB", (64, 48)).save(tmp_path / name)
+    add_photos(tmp_path / "d.db", tmp_path, [names])
+    monkeypatch.setattr(pairs, "ALL_UP_TO", 2)
+    monkeypatch.setattr(pairs, "ALONG", 2)
+    videos = [["1.png", "left out.png", "2.png", "3.png", "4.png"], ["5.png", "6.png"]]
+    chosen = pairs.choose_pairs(tmp_path / "d.db", names, videos)
+    assert [first[0] + second[0] for first, second in chosen] == ["12", "13", "23", "24", "34", "56"]
+
+
 def test_photos_that_are_not_used_any_more_do_not_tell_whether_the_background_stands_still(tmp_path):
     """Three photos of a turntable were replaced by two of a moving camera, whose pair is all that counts."""
     names, path = ["1.png", "2.png", "3.png", "new 1.png", "new 2.png"], tmp_path / "d.db"

@@ -394,7 +394,7 @@ def test_pairs_of_large_sets_are_chosen_by_sift(network, photos, tmp_path, stand
     shutil.copytree(images, capture / "images")
     write_json(capture / "sfm" / photo_matches.GROUPS, [{"names": names, "camera": None}])
     reporter = StoppingReporter(Reporter(), StopRequest())
-    wanted = photo_matches.Wanted(capture, names, False, network)
+    wanted = photo_matches.Wanted(capture, names, [], network)
     assert photo_matches.match_photos(wanted, images, False, reporter) == path
     chosen = database.read_pairs(capture / "sfm" / "pairs.txt")
     assert {name for pair in chosen for name in pair} == set(names) and len(chosen) < stand_in.pairs

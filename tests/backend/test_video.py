@@ -647,6 +647,7 @@ def test_a_photo_beside_a_video_of_its_name_is_no_live_photo(tmp_path):
     chosen = [tmp_path / "room.jpg", tmp_path / "room.mp4"]
     taken = photos.take_photos(chosen, tmp_path / "capture", 3, reporter())
     assert len(taken.photos) == 4
+    assert taken.videos == [[photo.name for photo in taken.photos if photo.name != "room.jpg"]]
 
 
 def test_panoramas_are_left_out(tmp_path):
@@ -736,7 +737,7 @@ def test_other_number_of_frames_replaces_them(tmp_path):
     (tmp_path / "capture" / "sfm").mkdir(parents=True)
     for count in (12, 12, 5):
         taken = photos.take_photos([tmp_path / "a.mp4"], tmp_path / "capture", count, reporter())
-        assert len(taken.photos) == count and taken.in_order
+        assert len(taken.photos) == count and taken.videos == [[photo.name for photo in taken.photos]]
         kept = sorted(path.name for path in (tmp_path / "capture" / "images").iterdir())
         assert kept == [photo.name for photo in taken.photos]
 

@@ -34,13 +34,13 @@ class Wanted(NamedTuple):
     Attributes:
         capture: folder of the capture, with images/ and sfm/groups.json.
         names: the photos.
-        in_order: whether they are frames of videos, so that neighbors show the same.
+        videos: the names of the frames of each video in their order, so that neighbors show the same.
         matcher: folder with the checkpoint of networks, or None for SIFT.
     """
 
     capture: Path
     names: list[str]
-    in_order: bool
+    videos: list[list[str]]
     matcher: Path | None
 
 
@@ -134,7 +134,7 @@ def _find_features(wanted: Wanted, on_objects: bool, reporter: StoppingReporter)
 
 def _choose_pairs(path: Path, wanted: Wanted, reporter: StoppingReporter) -> list[tuple[str, str]] | None:
     reporter.begin("pairs", "Comparing the photos")
-    return choose_pairs(path, wanted.names, wanted.in_order, reporter.progress)
+    return choose_pairs(path, wanted.names, wanted.videos, reporter.progress)
 
 
 def _write_pairs(wanted: Wanted, pairs: list[tuple[str, str]]) -> Path:

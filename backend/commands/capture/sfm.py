@@ -164,7 +164,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     reporter.begin("photos", "Reading the photos")
     files = digest_of_files(made_from, capture)
     lenses = () if made_from.calibration is None else read_calibration(made_from.calibration)
-    photos, unreadable, in_order = take_photos(made_from.photos, capture, made_from.frames, reporter, lenses)
+    photos, unreadable, videos = take_photos(made_from.photos, capture, made_from.frames, reporter, lenses)
     if are_copied(made_from.photos, capture):
         source = images
     else:
@@ -180,7 +180,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     if kind == LOFTR:
         per_photo, per_pair = _EXTRACT if count > ALL_UP_TO else 0.0, _MATCH_LOFTR
         reporter.expect({"join": ("Matching", _JOIN * pairs_expected)})
-    if count > ALL_UP_TO and not in_order:
+    if count > ALL_UP_TO:
         reporter.expect({"pairs": ("Pairs", _COMPARE * count * (count - 1) / 2)})
     reporter.expect({
         "extract": ("Features", per_photo * count), "match": ("Matching", per_pair * pairs_expected),
@@ -195,7 +195,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
     calibrated = ["calibrated"] if made_from.calibration else []
     listed_names = work / "names.json"
     write_json(listed_names, names)
-    wanted = Wanted(capture, names, in_order, made_from.matcher)
+    wanted = Wanted(capture, names, videos, made_from.matcher)
     path = match_photos(wanted, source, made_from.features == "objects", reporter)
     on_objects = path.name.endswith(database.ON_OBJECTS)
 

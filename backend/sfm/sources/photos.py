@@ -50,12 +50,12 @@ class Taken(NamedTuple):
     Attributes:
         photos: in natural order of their names.
         unreadable: name -> reason for files that cannot be read.
-        in_order: whether all are frames of videos, so that neighbors show the same.
+        videos: the names of the frames of each video in their order, so that neighbors show the same.
     """
 
     photos: list[Photo]
     unreadable: dict[str, str]
-    in_order: bool
+    videos: list[list[str]]
 
 
 def take_photos(
@@ -165,6 +165,7 @@ def take_photos(
             unreadable[name] = str(error)
     stamps.write()
     stems = Counter(_stem_in(base, path).casefold() for path in videos)
+    filmed = []
     for path in videos:
         folder = "" if is_alone else _stem_in(base, path)
         if stems[folder.casefold()] > 1:
@@ -172,10 +173,11 @@ def take_photos(
         folder = _readable(Path(folder)).as_posix() if folder else ""
         try:
             taken = _frames_of(path, capture, folder, frames, reporter)
-            width, height = image_size(capture / IMAGES / folder / taken[0])
+            own = [(Path(folder) / name).as_posix() for name in taken]
             photos += [
-                Photo((Path(folder) / name).as_posix(), f"video {folder}", f"{width}x{height}") for name in taken
+                Photo(name, f"video {folder}", "{}x{}".format(*image_size(capture / IMAGES / name))) for name in own
             ]
+            filmed.append(own)
         except InputError as error:
             if is_alone:
                 raise
@@ -199,7 +201,7 @@ def take_photos(
     if not from_copies and not in_place:
         warn_of_gone(names.values(), capture, stamps, reporter)
     stamps.write()
-    return Taken(photos, unreadable, not files)
+    return Taken(photos, unreadable, filmed)
 
 
 def are_copied(sources: Sequence[Path], capture: Path) -> bool:
