@@ -29,7 +29,7 @@ class Agreement(NamedTuple):
     """Agreement of a model with its matches.
 
     Attributes:
-        support: name -> fraction of the photo's matches that are in pairs which fit to the poses.
+        support: name -> fraction of the photo's matches that are in pairs which fit to the poses; 1 without matches.
         trusted: names of the photos whose poses are trusted.
     """
 
@@ -62,7 +62,9 @@ def measure_agreement(model: pycolmap.Reconstruction, path: Path) -> Agreement:
             for number in (first, second):
                 matches[number] += len(inliers)
                 fits[number] += len(inliers) * bool(close.mean() >= _PAIR_FITS)
-    support = {image.name: fits[number] / max(matches[number], 1) for number, image in posed.items()}
+    support = {
+        image.name: fits[number] / matches[number] if matches[number] else 1.0 for number, image in posed.items()
+    }
     trusted = frozenset(
         image.name for image in posed.values() if support[image.name] >= AGREES and image.num_points3D >= FEWEST_POINTS
     )

@@ -17,7 +17,7 @@ _SHIFT = 0.02
 """The same of relative positions, as a fraction of the length of the diagonal of all positions."""
 
 
-def tie_rigs(model: pycolmap.Reconstruction) -> list[list[str]]:
+def tie_rigs(model: pycolmap.Reconstruction, left_out: Sequence[pycolmap.Image] = ()) -> list[list[str]]:
     """Make rigs of cameras whose photos of the same name lie in several folders, if they keep their relative poses.
 
     The poses of a rig's cameras are determined together from then on, and a photo without a pose gets that which the
@@ -25,6 +25,7 @@ def tie_rigs(model: pycolmap.Reconstruction) -> list[list[str]]:
 
     Args:
         model: the poses; changed in place.
+        left_out: photos that mappers have left out; those of a rig are added if another one of their moment has a pose.
 
     Returns:
         The folders of each rig, with slashes at the end.
@@ -32,6 +33,7 @@ def tie_rigs(model: pycolmap.Reconstruction) -> list[list[str]]:
     rigs = _find(model)
     if not rigs:
         return []
+    _add(model, left_out, rigs)
     # COLMAP takes all images whose names begin with a folder, also those in folders inside.
     names = {number: image.name for number, image in model.images.items()}
     flat = {folder: f"{number}/" for number, folder in enumerate({_folder(name) for name in names.values()})}
@@ -102,6 +104,17 @@ def _find(model: pycolmap.Reconstruction) -> list[list[str]]:
             found.append([first, *fixed])
         left = [folder for folder in rest if folder not in fixed]
     return found
+
+
+def _add(model: pycolmap.Reconstruction, photos: Sequence[pycolmap.Image], rigs: list[list[str]]) -> None:
+    """Add photos, without poses, to a model if they are of a rig and another one of their moment has a pose."""
+    cameras = {image.name: image.camera_id for image in (model.image(number) for number in model.reg_image_ids())}
+    lenses = {_folder(name): camera for name, camera in cameras.items()}
+    for photo in photos:
+        folder = _folder(photo.name)
+        moment = [other + photo.name[len(folder) :] for rig in rigs if folder in rig for other in rig]
+        if photo.camera_id == lenses.get(folder) and any(name in cameras for name in moment):
+            model.add_image_with_trivial_frame(photo)
 
 
 def _are_fixed(pairs: Sequence[tuple[np.ndarray, np.ndarray]], size: float) -> bool:

@@ -9,7 +9,8 @@ The first argument is the number of threads, followed by the stage and its argum
     worker match-places MODEL MATCHED IMAGES PAIRS.txt   places that the pairs show in common, by a network
     worker join-pairs MATCHED DATABASE IMAGES GROUPS.json [MASKS]   features at these places, and verified matches
     worker incremental|global DATABASE IMAGES OUT NAMES.json [calibrated]   poses of the named photos, and points
-    worker refine MODEL OUT [calibrated]   the same without wrong matches, and with the lens that photos show
+    worker refine MODEL OUT DATABASE NAMES.json [calibrated]   the same without wrong matches, and with the lens that
+        photos show
 
 Each group is {"names": [...], "camera": null or {"model": ..., "params": [...]}}, the lens if it is known. Lenses that
 are calibrated are kept.
@@ -214,7 +215,7 @@ def map_globally(database: str, images: str, out: str, names: str, calibrated: s
     pycolmap.global_mapping(database, images, out, options=options)
 
 
-def refine(model: str, out: str, calibrated: str = "") -> None:
+def refine(model: str, out: str, database: str, names: str, calibrated: str = "") -> None:
     """Refine poses and points without wrong matches, with the lens that the photos show unless it is calibrated.
 
     Cameras that are fixed to each other keep their relative poses. The lens is a pinhole with as few terms of radial
@@ -223,7 +224,7 @@ def refine(model: str, out: str, calibrated: str = "") -> None:
     lens with one term fits better than a pinhole with one.
     """
     start = pycolmap.Reconstruction(model)
-    tie_rigs(start)
+    tie_rigs(start, left_out(start, database, json.loads(Path(names).read_text(encoding="utf-8"))))
     if calibrated:
         adjust(start, keep_lens=True)
         remove_outliers(start, keep_lens=True)
@@ -240,6 +241,17 @@ def refine(model: str, out: str, calibrated: str = "") -> None:
             chosen = fit
     remove_outliers(chosen.model)
     chosen.model.write(out)
+
+
+def left_out(model: pycolmap.Reconstruction, database: str, names: list[str]) -> list[pycolmap.Image]:
+    """Return the named photos of a database that are not in a model, since mappers leave out what matches nothing."""
+    wanted = set(names) - {image.name for image in model.images.values()}
+    with pycolmap.Database.open(database) as opened:
+        return [
+            pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+            for image in opened.read_all_images()
+            if image.name in wanted
+        ]
 
 
 class _Fit(NamedTuple):

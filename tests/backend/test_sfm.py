@@ -497,6 +497,19 @@ def test_wrong_pose_is_not_trusted(made, tmp_path):
     assert len(found.trusted) == VIEWS - 1
 
 
+def test_photo_that_matches_nothing_has_a_pose_that_no_match_contradicts(made, monkeypatch):
+    path = made / "sfm" / database.NAME
+    ids, real = database.image_ids(path), database.verified_pairs
+    model, without = pycolmap.Reconstruction(made / "sparse" / "0"), ids["photo 3.png"]
+    monkeypatch.setattr(
+        agreement.database, "verified_pairs", lambda *given: [pair for pair in real(*given) if without not in pair[:2]]
+    )
+    support = agreement.measure_agreement(model, path).support
+    assert support["photo 3.png"] == 1.0
+    weak = check.weak_photos({name: check.PhotoFigures(own, 0.5, 0) for name, own in support.items()})
+    assert weak["photo 3.png"] == "only 0 points determine its pose"
+
+
 def test_epipolar_errors_are_angles():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (50, 3))

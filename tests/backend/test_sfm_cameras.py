@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from backend.cli import main as command_line
-from backend.sfm import rig
+from backend.sfm import rig, worker
 from backend.sfm.model import centers_of
 from backend.shared.errors import EXIT_DONE
 
@@ -116,6 +116,23 @@ def test_photo_without_pose_gets_that_of_its_rig(pairs):
     assert rig.tie_rigs(model) == [["left/", "right/"]] == rig.rigs_of(model)
     (found,) = (image for image in model.images.values() if image.name == "right/3.png")
     assert np.abs(found.cam_from_world().matrix() - before).max() < 0.05
+
+
+def test_photo_that_matches_nothing_gets_the_pose_of_its_rig(pairs):
+    model = pycolmap.Reconstruction(pairs / "sfm" / "chosen")
+    (lost,) = (image for image in model.images.values() if image.name == "right/3.png")
+    before = lost.cam_from_world().matrix()
+    lost.name = "other/3.png"
+    names = [*(image.name for image in model.images.values()), "right/3.png"]
+    assert not worker.left_out(model, str(pairs / "sfm" / "database.db"), names[:-1]), "it is not used"
+    (photo,) = worker.left_out(model, str(pairs / "sfm" / "database.db"), names)
+    assert (photo.name, photo.camera_id) == ("right/3.png", lost.camera_id)
+    photo.image_id = 100
+    alone = pycolmap.Image(name="right/9.png", camera_id=lost.camera_id, image_id=101)
+    other = pycolmap.Image(name="right/4.png", camera_id=lost.camera_id % 2 + 1, image_id=102)
+    assert rig.tie_rigs(model, [photo, alone, other]) == [["left/", "right/"]]
+    assert np.abs(model.image(100).cam_from_world().matrix() - before).max() < 0.05
+    assert model.num_images() == 11 == model.num_reg_images()
 
 
 @pytest.mark.parametrize("second", ["right/", "left/right/"])

@@ -109,7 +109,8 @@ def test_poses_follow_from_joined_matches(photos, tmp_path, stand_in):
     (tmp_path / "names.json").write_text(json.dumps(names))
     worker.map_globally(str(tmp_path / "d.db"), str(images), str(tmp_path), str(tmp_path / "names.json"))
     (tmp_path / "sparse" / "0").mkdir(parents=True)
-    worker.refine(str(tmp_path / "0"), str(tmp_path / "sparse" / "0"))
+    refined, listed = tmp_path / "sparse" / "0", tmp_path / "names.json"
+    worker.refine(str(tmp_path / "0"), str(refined), str(tmp_path / "d.db"), str(listed))
     degrees, places = pose_errors(tmp_path, ring())
     assert len(degrees) == len(names) and degrees.max() < 0.5 and places.max() < 0.005
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")

@@ -225,7 +225,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         )
     wrong = model.drop_untrusted(best)
     model.require_parallax(best.model, source)
-    best = best._replace(model=_refined(best.model, work, log, calibrated, reporter))
+    best = best._replace(model=_refined(best.model, path, log, [str(listed_names), *calibrated], reporter))
     best = best._replace(agreement=measure_agreement(best.model, path))
     figures = check.figures_of(best.model, best.agreement)
     weak = check.weak_photos(figures)
@@ -302,16 +302,16 @@ def _had_size_by_gps(capture: Path) -> bool:
 
 
 def _refined(
-    found: pycolmap.Reconstruction, work: Path, log: Path, calibrated: list[str], reporter: StoppingReporter
+    found: pycolmap.Reconstruction, path: Path, log: Path, options: list[str], reporter: StoppingReporter
 ) -> pycolmap.Reconstruction:
-    """Return a model after a last adjustment, or the model itself if that fails."""
+    """Return a model after a last adjustment, or the model itself if that fails; path: of the database."""
     reporter.begin("refine", "Refining lenses and poses")
-    before, after = work / "chosen", work / "refined"
+    before, after = path.parent / "chosen", path.parent / "refined"
     for folder in (before, after):
         shutil.rmtree(folder, ignore_errors=True)
         make_folder(folder)
     found.write(before)
-    if run_stage(reporter, log, ["refine", str(before), str(after), *calibrated], lambda lines: lines, 1):
+    if run_stage(reporter, log, ["refine", str(before), str(after), str(path), *options], lambda lines: lines, 1):
         return pycolmap.Reconstruction(after)
     reporter.warning(f"The lenses and poses could not be refined and are less exact; {log} tells why.")
     return found
