@@ -559,6 +559,20 @@ def test_photos_are_turned_as_exif_says(tmp_path):
     assert photo_files.camera_of(tmp_path / "a.jpg", False).startswith("160x120")
 
 
+def test_avif_is_turned_and_other_formats_are_not(tmp_path):
+    exif, pixels = Image.Exif(), texture(2)[:120, :160].astype(np.uint8)
+    exif[0x0112] = 6
+    for suffix, size in ((".avif", (120, 160)), (".png", (160, 120)), (".webp", (160, 120))):
+        path = tmp_path / f"a{suffix}"
+        Image.fromarray(pixels).save(path, exif=exif)
+        for turn in (True, False):
+            made = photo_files.copy_photo(path, tmp_path / "images" / path.name, turn, True)
+            with Image.open(made) as image:
+                assert image.size == size
+                assert size == (160, 120) or image.getexif().get(0x0112, 1) == 1
+            assert photo_files.camera_of(path, turn).startswith("{}x{}".format(*size))
+
+
 def test_doubles_and_live_photos_are_taken_once(tmp_path):
     folder = tmp_path / "phone"
     folder.mkdir()

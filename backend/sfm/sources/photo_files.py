@@ -7,7 +7,6 @@ import io
 import re
 import shutil
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -47,7 +46,7 @@ def camera_of(path: Path, turned: bool) -> str:
 
     Args:
         path: the photo.
-        turned: whether it is turned as its EXIF orientation says.
+        turned: whether JPEGs are turned as their EXIF orientation says, as HEIC and AVIF always are, and others never.
 
     Raises:
         InputError: it cannot be read.
@@ -57,13 +56,14 @@ def camera_of(path: Path, turned: bool) -> str:
             warnings.simplefilter("ignore")
             with PilImage.open(path) as image:
                 size, exif = image.size, image.getexif()
+                is_upright = image.format in _HEIC_FORMATS or (turned and image.format in _JPEG_FORMATS)
                 # Before the pixels, after which the file may be closed.
                 lens = _lens_of(exif)
                 image.draft("L", (64, 64))  # Decodes a JPEG at an eighth of its size.
                 image.load()
     except Exception as error:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged or its format is unknown.") from error
-    if turned and _orientation(exif) > 4:
+    if is_upright and _orientation(exif) > 4:
         size = size[::-1]
     return f"{size[0]}x{size[1]} {lens}"
 
@@ -117,7 +117,8 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
     Args:
         path: the photo.
         target: the copy, whose suffix may change.
-        turn: whether to turn it as its EXIF orientation says, so that it stands upright; the pixels of others are kept.
+        turn: whether to turn a JPEG as its EXIF orientation says, so that it stands upright; HEIC and AVIF always are,
+            and the pixels of others are kept.
         again: whether to do so even if it was done, as the photo has changed.
 
     Returns:
@@ -132,12 +133,10 @@ def copy_photo(path: Path, target: Path, turn: bool, again: bool = False) -> Pat
     make_folder(target.parent)
     if path.suffix.lower() in RAW:
         write_image(target, _developed(path), _lens_data(path))
-    elif _is_heic(path):
-        write_atomic(target, _as_jpeg(path, lambda image: image))
+    elif _is_heic(path) or (turn and _is_jpeg(path) and _is_turned(path)):
+        write_atomic(target, _upright_jpeg(path))
     elif not is_read_by_colmap(path) and not _is_jpeg(path):
         write_image(target, read_image(path))
-    elif turn and _is_jpeg(path) and _is_turned(path):
-        write_atomic(target, _as_jpeg(path, ImageOps.exif_transpose))
     else:
         with atomic_path(target) as part:
             shutil.copyfile(path, part)
@@ -176,12 +175,12 @@ def _format_of(path: Path) -> str | None:
         return None
 
 
-def _as_jpeg(path: Path, change: Callable[[PilImage.Image], PilImage.Image]) -> bytes:
-    """Return a changed photo as JPEG in sRGB with its EXIF data; raises InputError if it is damaged."""
+def _upright_jpeg(path: Path) -> bytes:
+    """Return a photo that stands upright as JPEG in sRGB with its EXIF data; raises InputError if it is damaged."""
     buffer = io.BytesIO()
     try:
         with PilImage.open(path) as image:
-            changed = in_srgb(change(image))
+            changed = in_srgb(ImageOps.exif_transpose(image))
             changed.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=changed.getexif())
     except Exception as error:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged.") from error
