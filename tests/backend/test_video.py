@@ -306,6 +306,16 @@ def test_heic_of_phones_has_a_profile(tmp_path):
             assert image.getexif().get_ifd(0x8769)[0x920A] == pytest.approx(4.25)
 
 
+def test_heic_with_more_data_than_a_jpeg_can_have(tmp_path):
+    exif = Image.Exif()
+    exif[0x010F], exif.get_ifd(0x8769)[0x920A] = "Maker", 4.25
+    exif.get_ifd(0x8769)[0x927C] = b"\1" * 70_000
+    Image.fromarray(texture(2)[:120, :160].astype(np.uint8)).save(tmp_path / "a.heic", exif=exif.tobytes())
+    made = photo_files.copy_photo(tmp_path / "a.heic", tmp_path / "images" / "a.heic", True)
+    assert "Maker" in photo_files.camera_of(made, True)
+    assert photo_files.camera_of(made, True) == photo_files.camera_of(tmp_path / "a.heic", True)
+
+
 def test_photos_of_another_format_than_their_name_says_are_converted(tmp_path):
     heic(tmp_path / "a.heic")
     (tmp_path / "a.heic").rename(tmp_path / "a.jpg")

@@ -32,6 +32,8 @@ _ZOOM = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTag
 """EXIF entries of the lens; a digital zoom keeps the size and the focal length."""
 _QUALITY = 97
 """JPEG quality of photos that are converted or turned."""
+_MOST_EXIF = 65_533
+"""Number of bytes of EXIF data that a JPEG can have; those of HEIC are longer if its maker adds many notes."""
 _PROJECTION = re.compile(rb"GPano:ProjectionType\W+(\w+)")
 _PROJECTIONS = {b"equirectangular": "a 360-degree panorama", b"cylindrical": "a stitched panorama"}
 """Entry of Google's Photo Sphere data in XMP, and its values."""
@@ -181,7 +183,10 @@ def _upright_jpeg(path: Path) -> bytes:
     try:
         with PilImage.open(path) as image:
             changed = in_srgb(ImageOps.exif_transpose(image))
-            changed.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=changed.getexif())
+            exif = changed.getexif()
+            if len(exif.tobytes()) > _MOST_EXIF:
+                exif.get_ifd(ExifTags.IFD.Exif).pop(ExifTags.Base.MakerNote, None)
+            changed.convert("RGB").save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
     except Exception as error:
         raise InputError(f"{path.name} cannot be read as an image: it is damaged.") from error
     return buffer.getvalue()
