@@ -31,11 +31,16 @@ _TEST = (sys.executable, "-m", "backend.commands.setup.self_test")
 _LONGEST, _POLLED_EVERY, _ENDS_WITHIN = 900.0, 0.3, 10.0
 """Seconds after which the test has failed, as it compiles kernels, too, between two looks at it, and for its end."""
 _PASSING = re.compile(
-    r"out.of.memory|busy or unavailable|^KeyboardInterrupt|^it ended with exit code (?:-2|-9|-15|3221225786)$",
+    r"out.of.memory|of memory free|_ALLOC_FAILED|MemoryError|not enough memory|Errno (?:12|28)\b"
+    r"|WinError (?:8|14|112|1455)\b|busy or unavailable|^KeyboardInterrupt"
+    r"|^it ended with exit code (?:-2|-9|-15|3221225786)$",
     re.IGNORECASE,
 )
-"""Problems that are not the GPU's: other programs use it or its memory, or the test was ended by the user or the system
-(with SIGINT, SIGKILL, SIGTERM or, on Windows, an interrupt)."""
+"""Problems that are not the GPU's: other programs use it or its memory, the computer's memory, page file or disk is
+full, or the test was ended by the user or the system (with SIGINT, SIGKILL, SIGTERM or, on Windows, an interrupt)."""
+
+_ERROR = re.compile(r"[\w.]*(?:Error|Exception|Interrupt)\b")
+"""Beginning of the line in which Python names the error that ends a process."""
 
 
 def choose_device(requested: str, reporter: Reporter, again: bool = False) -> torch.device:
@@ -127,4 +132,6 @@ def _test(device: torch.device, reporter: Reporter) -> str:
         with contextlib.suppress(ValueError, IndexError, KeyError, TypeError):
             return str(json.loads(printed.read_bytes().splitlines()[-1])["problem"])
         lines = errors.read_text(errors="replace").strip().splitlines()
-        return lines[-1].strip().rstrip(".") if lines else f"it ended with exit code {process.returncode}"
+        # torch's errors have further lines, which advise programmers.
+        last = next((line for line in reversed(lines) if _ERROR.match(line)), lines[-1] if lines else "")
+        return last.strip().rstrip(".") or f"it ended with exit code {process.returncode}"
