@@ -34,6 +34,7 @@ from backend.training.optimizer.adam import step_rows, take_rows
 from backend.training.settings import Settings
 from backend.training.step import strips
 from backend.training.trainer import Trainer
+from tests.gpu import test_training as gpu_tests
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = Settings(offsets=4, sh_degree=1)
@@ -658,3 +659,12 @@ def test_training_imports_no_capture_packages():
         f"import sys; sys.modules.update(dict.fromkeys({absent})); import backend.training.trainer, backend.model.draw"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=120)
+
+
+def test_the_capture_of_the_gpu_tests_can_be_trained_on(tmp_path):
+    """Those tests run only where there is a GPU."""
+    spheres = gpu_tests.Spheres()
+    Trainer.start(spheres, spheres.ids, gpu_tests.SETTINGS).run(Budget(steps=2), tmp_path, Reporter())
+    resumed, _ = Trainer.resume(spheres, tmp_path, gpu_tests.SETTINGS)
+    resumed.run(Budget(steps=3), tmp_path, Reporter())
+    assert resumed.progress.step == 3 and gpu_tests.quality(resumed)[0] > 5

@@ -42,6 +42,12 @@ class View:
     viewmat: np.ndarray
     camera_id: int = 1
 
+    def pixels_of(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        z = np.maximum(xyz[:, 2], 1e-9)
+        x, y = (xyz[:, i] / z * self.K[i, i] + self.K[i, 2] for i in (0, 1))
+        inside = np.flatnonzero((xyz[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < self.width) & (y < self.height))
+        return inside, x[inside].astype(np.int64), y[inside].astype(np.int64)
+
 
 @dataclasses.dataclass(frozen=True)
 class Points:
@@ -59,6 +65,7 @@ class Spheres:
     """A capture of three shaded spheres by a ring of cameras, in memory."""
 
     has_masks = True
+    validation_indices = ()
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
