@@ -81,6 +81,7 @@ class ViewGradients(NamedTuple):
         heads: gradients of the parameters of the heads and of the background, in the order of `HeadAdam`; None for
             those that the loss does not depend on.
         colors: (2, 3), gradient of the photo's correction, if it is fitted.
+        in_view: () int64, on the GPU, if it renders the whole image: number of anchors in view.
         finite: () bool, on the GPU: whether the loss is finite and any anchor is in view.
         usable: (n,) bool, on the GPU: the rows whose gradients may be used.
         statistics: statistics of the image, if growth requires them.
@@ -92,6 +93,7 @@ class ViewGradients(NamedTuple):
     rows: torch.Tensor
     heads: Sequence[torch.Tensor | None]
     colors: torch.Tensor | None
+    in_view: torch.Tensor | None
     finite: torch.Tensor | None
     usable: torch.Tensor | None
     statistics: ViewStatistics | None
@@ -326,7 +328,7 @@ class ViewStep:
         assert rows.grad is not None
         return ViewGradients(
             (camera.width, camera.height), loss, seen, rows.grad, self._head_optimizer.gradients,
-            None if correction is None else correction.grad, finite, usable,
+            None if correction is None else correction.grad, in_view, finite, usable,
             ViewStatistics.of_view(statistics, anchors.layout.offsets, usable),
         )  # fmt: skip
 

@@ -376,7 +376,7 @@ class Trainer:
             else:
                 losses.append(gradients.loss)
                 if self.view_step.colors is not None and gradients.colors is not None:
-                    self.view_step.colors.step(index, gradients.colors, progress)
+                    self.view_step.colors.step(index, gradients.colors, progress, gradients.finite)
                 optimizer.update(gradients, progress, p.step)
                 fault = optimizer.check.take_fault()
             if fault is not None:

@@ -397,6 +397,25 @@ def test_nonfinite_image_loss_changes_nothing(tiny, emulate_gpu, monkeypatch):
     monkeypatch.undo()
 
 
+@pytest.mark.parametrize("on_gpu", [False, True])
+def test_a_photo_that_shows_no_anchor_is_no_fault(tiny, tmp_path, emulate_gpu, on_gpu):
+    emulate_gpu(on_gpu)
+    trainer = Trainer.start(*tiny(), dataclasses.replace(SMALL, fit_colors=True))
+    camera_of, (away, *others) = trainer.scene.camera, trainer.scene.capture.train_indices
+
+    def camera(index, downscale=1):
+        found = camera_of(index, downscale)
+        behind = found.viewmat - np.diag([0, 0, 1000.0, 0])[:, [0, 1, 3, 2]]
+        return dataclasses.replace(found, viewmat=behind) if index == away else found
+
+    trainer.scene.camera = camera
+    reporter = Messages()
+    trainer.run(Budget(steps=1 + len(others)), tmp_path, reporter)
+    assert not reporter.warnings and not trainer.progress.skipped
+    steps = trainer.view_step.colors.steps
+    assert steps[away] == 0 and (steps[others] == 1).all()
+
+
 LOSSES = """
 import sys
 from backend.capture import load_capture

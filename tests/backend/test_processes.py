@@ -141,12 +141,12 @@ def test_gradients_arrive_as_they_were_sent(tiny) -> None:
     capture, ids = tiny()
     trainer = Trainer.start(capture, ids, Settings(offsets=2, fit_colors=True))
     gradients = trainer.view_step.compute(capture.train_indices[0], 0.1)
-    gradients = gradients._replace(heads=[None, *gradients.heads[1:]])
+    gradients = gradients._replace(heads=[None, *gradients.heads[1:]], in_view=torch.tensor(7))
     shared = SharedViews(Echo(), trainer.settings.layout.columns, trainer.optimizer.heads.parameters)
     anchors = len(trainer.model.anchors)
     _, got, _ = shared.exchange(Outcome(gradients, None), None, anchors)
     assert got.fault is None and got.gradients.size == gradients.size and got.gradients.loss == gradients.loss
-    for name in ("seen", "rows", "colors"):
+    for name in ("seen", "rows", "colors", "in_view"):
         assert torch.equal(getattr(got.gradients, name), getattr(gradients, name)), name
     (none, *heads), (_, *wanted) = got.gradients.heads, gradients.heads
     assert none is None and all(torch.equal(have, want) for have, want in zip(heads, wanted, strict=True))

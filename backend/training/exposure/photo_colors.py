@@ -66,16 +66,19 @@ class PhotoColors:
         """Return a copy of the correction (2, 3) of a photo, to which a gradient can be accumulated."""
         return self.values[index].clone().requires_grad_()
 
-    def step(self, index: int, gradient: torch.Tensor, progress: float) -> None:
+    def step(self, index: int, gradient: torch.Tensor, progress: float, finite: torch.Tensor | None = None) -> None:
         """Update the correction of a photo, unless the gradient is not finite.
 
         Args:
             index: index of the photo.
             gradient: (2, 3), the gradient of the loss.
             progress: progress of the training, 0 .. 1.
+            finite: () bool; where it is False, nothing changes.
         """
         gradient = gradient + 2 * PULL * self.values[index]
         usable = gradient.isfinite().all()
+        if finite is not None:
+            usable = usable & finite
         steps = self.steps[index] + 1
         exp_avg = torch.lerp(gradient, self.exp_avg[index], BETA1)
         exp_avg_sq = torch.lerp(gradient * gradient, self.exp_avg_sq[index], BETA2)

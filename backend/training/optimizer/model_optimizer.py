@@ -69,6 +69,9 @@ class ModelOptimizer:
             optimizer.gradients = gradients.heads
             rates = {name: rate(HEAD_RATES[name], progress) for name in optimizer.groups}
             skipped = ~optimizer.step(rates, gradients.finite)
+        if gradients.in_view is not None:
+            # There is nothing to update for a photo that shows no anchor.
+            skipped = skipped & (gradients.in_view > 0)
         skipped = skipped + self.rows.step(
             anchors.rows, gradients.seen, gradients.rows, row_rates(self._settings, progress), step, gradients.usable
         )

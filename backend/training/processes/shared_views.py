@@ -49,9 +49,10 @@ class SharedViews:
         self._parameters = parameters
         self._device = parameters[0].device
         of_statistics = [(_I8, ()), (_I8, ()), (_F4, ()), (_FLAG, ()), (_F4, (2,)), (_FLAG, ())]
-        # Types and rows of size, loss, seen, rows, colors, finite and usable, of each parameter, and of the statistics.
+        # Types and rows of size, loss, seen, rows, colors, in_view, finite and usable, of each parameter, and of the
+        # statistics.
         self._kinds: list[tuple[torch.dtype, tuple[int, ...]]] = [
-            (_I8, ()), (_F4, ()), (_I8, ()), (_F4, (columns,)), (_F4, (2, 3)), (_FLAG, ()), (_FLAG, ()),
+            (_I8, ()), (_F4, ()), (_I8, ()), (_F4, (columns,)), (_F4, (2, 3)), (_I8, ()), (_FLAG, ()), (_FLAG, ()),
             *((_F4, ()) for _ in parameters), *of_statistics,
         ]  # fmt: skip
 
@@ -94,7 +95,7 @@ class SharedViews:
         if g is not None:
             statistics = [None] * 6 if g.statistics is None else g.statistics
             size = torch.tensor(g.size)
-            values = [size, g.loss, g.seen, g.rows, g.colors, g.finite, g.usable, *g.heads, *statistics]
+            values = [size, g.loss, g.seen, g.rows, g.colors, g.in_view, g.finite, g.usable, *g.heads, *statistics]
         return [
             torch.empty((0, *shape), dtype=kind, device=self._device)
             if value is None
@@ -105,7 +106,7 @@ class SharedViews:
     def _unpacked(self, tensors: Sequence[torch.Tensor]) -> ViewGradients | None:
         """Return the gradients in the result of `_packed`."""
         found = [tensor if len(tensor) else None for tensor in tensors]
-        size, loss, seen, rows, colors, finite, usable, *others = found
+        size, loss, seen, rows, colors, in_view, finite, usable, *others = found
         if size is None or loss is None or seen is None or rows is None:
             return None
         count = len(self._parameters)
@@ -121,5 +122,5 @@ class SharedViews:
         width, height = size.tolist()
         return ViewGradients(
             (width, height), loss[0], seen, rows, heads, None if colors is None else colors[0],
-            None if finite is None else finite[0], usable, statistics,
+            None if in_view is None else in_view[0], None if finite is None else finite[0], usable, statistics,
         )  # fmt: skip
