@@ -106,9 +106,15 @@ def _compiler() -> ctypes.CDLL:
     """Return the library NVRTC or HIPRTC: of torch where it has one, since another may be older."""
     if torch.version.cuda:
         major, packages = torch.version.cuda.partition(".")[0], Path(torch.__file__).parents[1]
-        name = f"nvrtc64_{major}0_0.dll" if sys.platform == "win32" else f"libnvrtc.so.{major}"
+        name, second = f"libnvrtc.so.{major}", f"libnvrtc-builtins.so.{major}*"
+        if sys.platform == "win32":
+            name, second = f"nvrtc64_{major}0_0.dll", f"nvrtc-builtins64_{major}*[0-9].dll"
         for folder in ("torch/lib", "nvidia/*/lib", "nvidia/*/bin", "nvidia/*/bin/*"):
             for path in sorted(packages.glob(f"{folder}/{name}")):
+                # Which NVRTC opens by its name alone, and so finds only where it is loaded already.
+                for beside in sorted(path.parent.glob(second)):
+                    with contextlib.suppress(OSError):
+                        ctypes.CDLL(str(beside))
                 with contextlib.suppress(OSError):
                     return ctypes.CDLL(str(path))
     try:

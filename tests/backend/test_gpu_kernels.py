@@ -254,6 +254,24 @@ def test_errors_of_compiler_and_driver_are_passed_on(machine):
         raster_kernel("order_equals")(1, 32, None, None, None, 3, None)
 
 
+@pytest.mark.parametrize(("platform", "folder", "names"), [
+    ("linux", "nvidia/cu13/lib", ["libnvrtc-builtins.so.13.0", "libnvrtc.so.13"]),
+    ("win32", "torch/lib", ["nvrtc-builtins64_130.dll", "nvrtc64_130_0.dll"]),
+])  # fmt: skip
+def test_the_compiler_finds_its_second_library(machine, monkeypatch, tmp_path, platform, folder, names):
+    """It is opened by its name alone when a kernel is compiled."""
+    loaded = []
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(torch, "__file__", str(tmp_path / "torch" / "__init__.py"))
+    monkeypatch.setattr(driver.sys, "platform", platform)
+    monkeypatch.setattr(driver.ctypes, "CDLL", loaded.append)
+    (tmp_path / folder).mkdir(parents=True)
+    for name in (*names, "libnvrtc-builtins.alt.so.13.0", "nvrtc-builtins64_130.alt.dll"):
+        (tmp_path / folder / name).write_bytes(b"")
+    driver._compiler()
+    assert loaded == [str(tmp_path / folder / name) for name in names]
+
+
 def test_source_depends_on_constants_and_variant():
     """So that a binary in the cache is of the same constants."""
     flat, round_ = (text_of("blend", {"LABELS": True, **PLAIN, "FLAT": flat}) for flat in (True, False))
