@@ -28,6 +28,9 @@ _OUT_OF_MEMORY_TEXTS = (
 _FAILURES = ("CUDA error", "HIP error", "CUDA_ERROR_", "hipError")
 """Beginnings of error texts of a GPU that failed while it computed."""
 
+_LONGEST_REASON = 300
+"""Characters of an error that are shown."""
+
 _NO_DRIVER = "There is no NVIDIA driver on this computer; install the one for your GPU from nvidia.com."
 _NO_GPU = "The NVIDIA driver shows no GPU that may be used; check nvidia-smi and CUDA_VISIBLE_DEVICES."
 
@@ -202,6 +205,8 @@ def _problem_with_kernels() -> str | None:
         if int(keys[0]) != 2**63 - 1:
             return "A kernel ran on the GPU without effect; restart the computer."
     except Exception as error:  # For any error, the CPU can be used instead.
-        first = f"{type(error).__name__}: {str(error).strip()}".partition("\n")[0].rstrip(".: ")
-        return f"Kernels do not run on this GPU ({first}); install a newer driver, or set the backend up again."
+        # The compiler names the cause in further lines; those of torch's errors advise programmers.
+        text = str(error).strip().partition("\n")[0] if is_failure(error) else str(error)
+        reason = " ".join(f"{type(error).__name__}: {text}".split())[:_LONGEST_REASON].rstrip(".: ")
+        return f"Kernels do not run on this GPU ({reason}); install a newer driver, or set the backend up again."
     return None

@@ -655,6 +655,20 @@ def test_low_memory_is_explained_with_figures():
     assert "has 0.5 GB of memory," in devices.explain_low_memory("GPU", 0.4e9, 0.5e9)
 
 
+def test_why_kernels_do_not_run_is_told(monkeypatch):
+    def broken(name):
+        raise RuntimeError(
+            f"the kernel {name} cannot be compiled:\nnvrtc: error: failed to open libnvrtc-builtins.so.13.0."
+        )
+
+    full, zeros = torch.full, torch.zeros
+    monkeypatch.setattr(torch, "full", lambda *arguments, device: full(*arguments))
+    monkeypatch.setattr(torch, "zeros", lambda *arguments, device, **options: zeros(*arguments, **options))
+    monkeypatch.setattr("backend.raster.gpu.kernels.raster_kernel", broken)
+    reason = devices._problem_with_kernels()
+    assert "cannot be compiled: nvrtc: error: failed to open libnvrtc-builtins.so.13.0);" in reason
+
+
 @without_cuda
 @pytest.mark.skipif(shutil.which("make") is None or shutil.which("nvidia-smi") is not None, reason="no make, or a GPU")
 def test_make_gpu_reports_missing_gpu():
