@@ -7,6 +7,7 @@ Functions with an implementation for each device call `on_gpu` with one of their
 from __future__ import annotations
 
 import functools
+import sys
 
 import numpy as np
 import torch
@@ -18,6 +19,9 @@ CHOICES = ("auto", "cpu", "cuda")
 
 MIN_FREE_MEMORY = 1e9
 """Bytes of GPU memory that must be free; CUDA itself and torch's libraries use about half of them."""
+
+_MOST_MEMORY = 0.95
+"""Largest fraction of the GPU's free memory that is used where it is limited."""
 
 _OUT_OF_MEMORY_TEXTS = (
     "CUDA_ERROR_OUT_OF_MEMORY", "CUDA error: out of memory", "HIP error: out of memory", "CUBLAS_STATUS_ALLOC_FAILED",
@@ -106,6 +110,18 @@ def is_out_of_memory(error: BaseException) -> bool:
 def is_failure(error: BaseException) -> bool:
     """Return whether an error of torch or of a kernel means that a GPU has failed while it computed."""
     return isinstance(error, RuntimeError) and any(words in str(error) for words in _FAILURES)
+
+
+@functools.cache
+def limit_memory(device: torch.device) -> None:
+    """Let torch say on Windows, too, that a GPU's memory is full, once in a process.
+
+    NVIDIA's driver would go on in the computer's memory there, many times slower and without an error.
+    """
+    if sys.platform == "win32":
+        free, total = torch.cuda.mem_get_info(device)
+        most = _MOST_MEMORY * (free + torch.cuda.memory_reserved(device)) / total
+        torch.cuda.set_per_process_memory_fraction(min(most, 1.0), device)
 
 
 def refused_gpu() -> str | None:

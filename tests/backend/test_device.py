@@ -31,6 +31,7 @@ from backend.training import step
 from backend.training.budget import Budget
 from backend.training.losses.on_cpu import image_loss, normal_loss, volume_loss
 from backend.training.optimizer.adam import step_rows, take_rows
+from backend.training.scene import Scene
 from backend.training.settings import Settings
 from backend.training.step import strips
 from backend.training.trainer import Trainer
@@ -542,6 +543,20 @@ def test_persistent_out_of_memory_ends_with_checkpoint(tiny, tmp_path, emulate_g
         trainer.run(Budget(steps=20), tmp_path, Reporter())
     resumed, _ = Trainer.resume(capture, tmp_path, SMALL)
     assert resumed.progress.step == 3
+
+
+@pytest.mark.parametrize(("platform", "limits"), [("win32", [0.95 * 0.75]), ("linux", [])])
+def test_the_memory_of_windows_is_not_taken_for_the_gpus(monkeypatch, platform, limits):
+    found, gpu = [], torch.device("cuda", 0)
+    monkeypatch.setattr(devices.sys, "platform", platform)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (5e9, 8e9))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda _: 1e9)
+    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda most, _: found.append(most))
+    devices.limit_memory.cache_clear()
+    for _ in range(2):
+        Scene(None, None, None, device=gpu, gains=np.ones((1, 3)))
+    devices.limit_memory.cache_clear()
+    assert found == pytest.approx(limits)
 
 
 def test_views_are_drawn_in_parts_where_the_memory_is_full(tiny, monkeypatch):
