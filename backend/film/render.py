@@ -6,13 +6,14 @@ light, and then averaged over the shutter time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..model.draw import in_parts
 from ..raster import Camera, Rendered, devices, object_ranks, rasterize
 from ..raster.ranked_ids import add_ranked
 from ..shared.color.srgb import decode, encode
@@ -26,6 +27,9 @@ FAR = 1e10
 _KEPT = 16
 """Number of objects of each pixel that are kept while the samples of a frame are summed."""
 _FAINTEST = 1e-6
+
+_Planes = tuple[NDArray[np.float32], NDArray[np.float32] | None, list[NDArray]]
+"""Light (h, w, 4), depth (h, w) if it is wanted, and ranked IDs and their coverage (ranks, h, w)."""
 
 
 class FilmImage(NamedTuple):
@@ -45,7 +49,7 @@ class FilmImage(NamedTuple):
 
 
 def draw_frame(stage: Stage, shot: Shot, frame: Frame, after_sample: Callable[[int], object]) -> FilmImage:
-    """Render a frame.
+    """Render a frame, in parts if the GPU's memory is not enough for the whole.
 
     Args:
         stage: The splats.
@@ -64,11 +68,11 @@ def draw_frame(stage: Stage, shot: Shot, frame: Frame, after_sample: Callable[[i
     coverage = np.zeros((*shape, kept), np.float32)
     for number, sample in enumerate(frame.samples):
         is_middle = number == frame.middle
-        drawn = _draw(stage, shot, sample, is_middle)
-        rgba += _light(drawn)
-        if is_middle:
-            depth = _depth(drawn, shot.depth_scale)
-        add_ranked(ids, coverage, *(devices.host(plane) for plane in object_ranks(drawn, kept)))
+        for rows, (light, its_depth, ranked) in _draw(stage, shot, sample, is_middle, kept):
+            rgba[rows] += light
+            if its_depth is not None:
+                depth[rows] = its_depth
+            add_ranked(ids[rows], coverage[rows], *ranked)
         after_sample(number + 1)
     rgba /= np.float32(count)
     coverage /= np.float32(count)
@@ -87,14 +91,20 @@ def to_srgb_8bit(rgba: NDArray) -> NDArray[np.uint8]:
     return np.rint(255.0 * np.clip(np.concatenate([straight, alpha], -1), 0.0, 1.0)).astype(np.uint8)
 
 
-def _draw(stage: Stage, shot: Shot, sample: Sample, with_depth: bool) -> Rendered:
+def _draw(stage: Stage, shot: Shot, sample: Sample, with_depth: bool, ranks: int) -> Iterator[tuple[slice, _Planes]]:
+    """Render a sample; yields rows of the image, and their planes."""
     camera = Camera(sample.viewmat, sample.K, shot.width, shot.height, near=sample.clip[0], blur=stage.blur)
     splats: dict[str, Any] = stage.at(sample, shot.only_named)
-    with torch.no_grad():
-        return rasterize(
-            **splats, camera=camera, want_depth=with_depth, want_median=with_depth,
-            primitive=stage.primitive,
-        )  # fmt: skip
+
+    def render(part: Camera) -> _Planes:
+        with torch.no_grad():
+            drawn = rasterize(
+                **splats, camera=part, want_depth=with_depth, want_median=with_depth, primitive=stage.primitive
+            )
+        depth = _depth(drawn, shot.depth_scale) if with_depth else None
+        return _light(drawn), depth, [devices.host(plane) for plane in object_ranks(drawn, ranks)]
+
+    return in_parts(camera, splats["means"].device, render)
 
 
 def _light(drawn: Rendered) -> NDArray[np.float32]:

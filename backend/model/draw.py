@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -32,8 +32,41 @@ class RenderedView(NamedTuple):
     depth: np.ndarray | None
 
 
+_Planes = TypeVar("_Planes")
+
 _LEAST_HEIGHT = 16
 """Height in pixels from which on a part of an image is divided further, where the GPU's memory is full."""
+
+
+def in_parts(
+    camera: Camera, device: torch.device, render: Callable[[Camera], _Planes]
+) -> Iterator[tuple[slice, _Planes]]:
+    """Render a view as a whole, or its halves, and theirs, where the GPU's memory is not enough.
+
+    Args:
+        camera: the view.
+        device: the device that renders it.
+        render: renders a part of the view; what it returns should not be on the GPU.
+
+    Yields:
+        The rows of the image, from top to bottom, and what `render` has returned for them.
+    """
+    left = [(0, camera.height)]
+    while left:
+        first, count = left.pop()
+        try:
+            planes = render(camera if count == camera.height else camera.crop(0, first, camera.width, count))
+        except Exception as error:
+            if count < 2 * _LEAST_HEIGHT or not devices.is_out_of_memory(error):
+                raise
+            left += [(first + count // 2, count - count // 2), (first, count // 2)]
+        else:
+            yield slice(first, first + count), planes
+            continue
+        # Only now, as the error has kept what it was raised with.
+        forget_capacity(device)
+        if device.type == "cuda":
+            torch.cuda.empty_cache()
 
 
 def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: bool = False) -> RenderedView:
@@ -48,21 +81,12 @@ def draw(model: ObjectModel, camera: Camera, want_ids: bool = True, want_depth: 
     Returns:
         The rendered view, as NumPy arrays.
     """
-    try:
-        return _drawn(model, camera, want_ids, want_depth)
-    except Exception as error:
-        if camera.height < 2 * _LEAST_HEIGHT or not devices.is_out_of_memory(error):
-            raise
-    forget_capacity(model.device)
-    if model.device.type == "cuda":
-        torch.cuda.empty_cache()
-    half = camera.height // 2
-    halves = [
-        draw(model, camera.crop(0, first, camera.width, count), want_ids, want_depth)
-        for first, count in ((0, half), (half, camera.height - half))
-    ]
+    found = in_parts(camera, model.device, lambda part: _drawn(model, part, want_ids, want_depth))
+    parts = [view for _, view in found]
+    if len(parts) == 1:
+        return parts[0]
     return RenderedView._make(
-        None if planes[0] is None else np.concatenate(planes) for planes in zip(*halves, strict=True)
+        None if planes[0] is None else np.concatenate(planes) for planes in zip(*parts, strict=True)
     )
 
 

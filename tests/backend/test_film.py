@@ -17,7 +17,7 @@ from backend.export.ply import read_splats, write_splats
 from backend.film import cryptomatte, exr
 from backend.film.render import FAR
 from backend.model.splats import Splats, concatenate
-from backend.raster import Camera
+from backend.raster import Camera, rasterize
 from backend.raster.ranked_ids import add_ranked
 from backend.raster.reference import rasterize_reference
 from backend.shared.color.recolor import Recolor
@@ -167,6 +167,21 @@ def test_frame_matches_reference(folder, film, primitive, blur):
     solid = rgba[..., 3] > 0.1
     assert np.abs(photo[..., :3] - 255 * np.clip(straight, 0, 1))[solid].max() < 1.5
     assert np.abs(photo[..., 3] - 255 * rgba[..., 3]).max() < 0.7
+
+
+def test_frame_is_drawn_in_parts_where_the_memory_is_full(folder, film, monkeypatch):
+    heights = []
+
+    def full(*, camera, **options):
+        heights.append(camera.height)
+        if camera.height > 20:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return rasterize(camera=camera, **options)
+
+    monkeypatch.setattr("backend.film.render.rasterize", full)
+    planes = film(shot_of([sample()]))[0]
+    assert heights == [33, 16, 17]
+    assert_same(planes, some_splats(), sample())
 
 
 def test_edits_and_shot_transforms_are_applied(folder, film):
