@@ -122,7 +122,7 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
     except Exception as error:
         if isinstance(error, OSError) and error.filename is None and error.errno in _OUTPUT_ERRORS:
             raise  # Files are written with their names in the error, so this is a stream.
-        sentence = _describe_error(error)
+        sentence = _describe_error(error, trains=hasattr(options, "max_anchors"))
         if sentence:
             _tell(reporter.error, _without_restart(_shortened(sentence), arguments, options))
             return EXIT_BAD_INPUT
@@ -154,7 +154,7 @@ def _shortened(sentence: str) -> str:
     return sentence if len(sentence) <= _LONGEST else f"{sentence[:half]} ... {sentence[-half:]}"
 
 
-def _describe_error(error: Exception) -> str | None:
+def _describe_error(error: Exception, trains: bool) -> str | None:
     """Return a sentence for errors due to missing memory, packages or files; None for all other errors."""
     try:
         from ..raster.devices import is_failure, is_out_of_memory
@@ -163,6 +163,8 @@ def _describe_error(error: Exception) -> str | None:
     except (ImportError, OSError):
         # The error may be that torch cannot be loaded.
         is_gpu_full = has_gpu_failed = False
+    if is_gpu_full and not trains:
+        return "The GPU's memory is full; close programs that use it, or use --device cpu."
     if is_gpu_full:
         return (
             "The GPU's memory is full; close programs that use it, or try a smaller --max-size or --max-anchors, or "

@@ -40,8 +40,8 @@ _PHRASES = {
 }
 """Advice that has other words in Blender."""
 _ONLY_TYPED = (
-    " (on the command line: `sfm`)", ", or use the option --overwrite", " or --steps", ", a different --out",
-    ", and `split` divides larger models into cells",
+    " (on the command line: `sfm`)", ", or use the option --overwrite", ", or use --device cpu", " or --steps",
+    ", a different --out", ", and `split` divides larger models into cells",
 )  # fmt: skip
 """Advice that Blender has no property for."""
 _FITS = re.compile(r"(?:--restart with )?--max-anchors \d+ fits")

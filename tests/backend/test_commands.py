@@ -903,6 +903,21 @@ def test_out_of_memory_is_reported(write_capture, run_command, monkeypatch, erro
     assert_rejected(run_command("check", write_capture().folder), "not enough memory", "--max-size")
 
 
+@pytest.mark.parametrize(("command", "more"), [
+    ("train", " or try a smaller --max-size or --max-anchors, or --device cpu. The same command resumes from the last "
+              "checkpoint."),
+    ("film", " or use --device cpu."),
+])  # fmt: skip
+def test_full_memory_of_the_gpu_is_reported_with_options_of_the_command(run_command, monkeypatch, command, more):
+    def greedy(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr("backend.commands.command_of", lambda _: greedy)
+    result = run_command(command, "a", "--out", "b", *(["--shot", "c"] if command == "film" else []), "--json")
+    assert result.code == EXIT_BAD_INPUT
+    assert result.messages("error") == [f"The GPU's memory is full; close programs that use it,{more}"]
+
+
 def test_nonfinite_figures_are_null(trained, run_command, monkeypatch):
     _, out = trained
     monkeypatch.setattr("backend.evaluation.metrics.psnr", lambda a, b: float("inf"))

@@ -593,6 +593,9 @@ def test_sentences_have_the_names_that_blender_shows():
     assert in_blender("The folder a contains files; choose an empty or new folder, or use the option --overwrite.") == (
         "The folder a contains files; choose an empty or new folder."
     )
+    assert in_blender("The GPU's memory is full; close programs that use it, or use --device cpu.") == (
+        "The GPU's memory is full; close programs that use it."
+    )
     assert in_blender("Train it with --mode explicit; specify more --minutes or --steps, or a smaller --set.") == (
         "Train it with the Model Plain Splats; specify more Minutes, or a smaller Set."
     )
