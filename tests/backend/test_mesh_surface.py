@@ -562,6 +562,22 @@ def test_object_cut_off_by_images_is_closed():
     assert 1.5 < np.ptp(surface.vertices[:, 0]) < 6
 
 
+def test_room_that_is_seen_from_inside_has_its_walls():
+    room = box((-1.0, -1.0, -0.7), (1.0, 1.0, 0.7))
+    cameras = []
+    for i in range(30):
+        angle, pitch = 2 * np.pi * i / 10, (-0.9, 0.0, 0.9)[i // 10]
+        across = np.array([np.cos(angle), np.sin(angle), 0.0])
+        camera = camera_at(-across * np.cos(pitch) + [0, 0, -np.sin(pitch)], 96, 72, 43.0)
+        viewmat = camera.viewmat.copy()
+        viewmat[:3, 3] = -viewmat[:3, :3] @ across * 0.3
+        cameras.append(replace(camera, viewmat=viewmat))
+    surface = extract(fuse(ExactViews([lambda p: -room(p)], cameras), [0], resolution=32))
+    assert is_watertight(surface.faces) and surface.unobserved.mean() < 0.1
+    assert volume(surface) == pytest.approx(-2 * 2 * 1.4, rel=0.02), "it faces the inside of the room"
+    assert errors(surface, room).mean() < 0.01
+
+
 def test_object_without_views_is_reported():
     wall, hidden = box((1.0, -2, -2), (1.1, 2, 2)), ball(radius=0.3)
     views = ExactViews([hidden, wall], [camera_at((2.5, 0.1 * i, 0)) for i in range(3)])

@@ -56,14 +56,18 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
 
 
 def _worth(vertices: np.ndarray, faces: np.ndarray, seen: np.ndarray, closed: bool) -> np.ndarray:
-    """Find the faces of components that are large enough, partly observed and not interior bubbles, (F,) bool."""
+    """Find the faces of components that are large enough, partly observed and not interior bubbles, (F,) bool.
+
+    A component that encloses empty space is a bubble, except where most of it was observed, as in a room.
+    """
     keep = of_size(vertices, faces)
     count, part = parts(faces, len(vertices))
     if closed and count:
         a, b, c = (vertices[faces[:, i]] for i in range(3))
         volume = np.bincount(part, (np.cross(a, b) * c).sum(1), count)
         looked_at = np.bincount(part, seen, count)
-        keep &= ((volume > 0) & (looked_at > 0))[part]
+        bubble = (volume <= 0) & (2 * looked_at <= np.bincount(part, minlength=count))
+        keep &= ((looked_at > 0) & ~bubble)[part]
     return keep
 
 
