@@ -578,6 +578,30 @@ def test_room_that_is_seen_from_inside_has_its_walls():
     assert errors(surface, room).mean() < 0.01
 
 
+def test_part_that_reaches_far_out_is_cut_off_and_closed():
+    def lamp(p):
+        return np.minimum(box((-0.3, -0.3, 0), (0.3, 0.3, 0.8))(p), rod((-0.3, 0, 0.3), (-4.5, 0, 0.3), 0.04)(p))
+
+    views = ExactViews([lamp], around(12, distance=3.0, heights=(0.8, 1.6, 2.4), width=160, height=120, focal=150.0))
+    field = fuse(views, [0])
+    surface = extract(field, faces=4000)
+    assert_valid_surface(surface)
+    assert surface.vertices[:, 0].min() < -3 and 2000 < len(surface.faces) <= 4000
+    at_end = surface.vertices[surface.faces].mean(1)[:, 0] < surface.vertices[:, 0].min() + 0.5 * field.voxel
+    assert surface.unobserved[at_end].all()
+
+
+def test_more_faces_than_allowed_are_reported(monkeypatch):
+    warnings = []
+    reporter = Reporter()
+    reporter.warning = warnings.append
+    field = fuse(ExactViews([ball()], around(6)), [0])
+    assert len(extract(field, faces=1000, reporter=reporter).faces) <= 1000 and not warnings
+    monkeypatch.setattr("backend.mesh.field.extract._sound", lambda *_: None)
+    assert len(extract(field, faces=1000, reporter=reporter).faces) > 1000
+    assert len(warnings) == 1 and "more than 1,000" in warnings[0]
+
+
 def test_object_without_views_is_reported():
     wall, hidden = box((1.0, -2, -2), (1.1, 2, 2)), ball(radius=0.3)
     views = ExactViews([hidden, wall], [camera_at((2.5, 0.1 * i, 0)) for i in range(3)])

@@ -28,8 +28,8 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
         field: The signed distance field.
         closed: Whether to return a watertight, two-manifold mesh in which the faces that no camera observed are marked
             as unobserved. Otherwise the mesh ends where no camera observed the object.
-        faces: The largest number of triangles.
-        reporter: Receives the progress.
+        faces: The largest number of triangles, exceeded only where fewer would tear the surface.
+        reporter: Receives the progress, and a warning if the surface has more triangles.
 
     Returns:
         The surface in scene units.
@@ -51,6 +51,8 @@ def extract(field: Field, closed: bool = True, faces: int = FACES, reporter: Rep
     full = vertices[triangles].mean(1)
     reduced, triangles = _reduced(vertices, triangles, faces, closed)
     reporter.progress(2.5, 3)
+    if len(triangles) > faces:
+        reporter.warning(f"The mesh has {len(triangles):,} triangles, more than {faces:,}: fewer would tear it.")
     _, nearest = cKDTree(full).query(reduced[triangles].mean(1))
     return Surface(field.origin + field.voxel * reduced, triangles, ~seen[nearest])
 

@@ -210,7 +210,7 @@ class _Fusion:
         total, weights = self._integrated(blocks.coords)
         winding = self._seen_surface(blocks, total, weights)
         values = self._finished(blocks.coords, total, weights, winding)
-        seen = self._seen(total, weights)
+        seen = self._seen(total, weights) & ~self._at_border(blocks.coords)
         fresh = np.arange(len(blocks))
         while True:
             coords = self._missing(blocks, values, fresh)
@@ -221,7 +221,7 @@ class _Fusion:
             fresh = np.arange(len(blocks), len(blocks) + len(coords))
             blocks = blocks.joined(coords)
             values = np.concatenate([values, self._finished(coords, total, weights, winding)])
-            seen = np.concatenate([seen, self._seen(total, weights)])
+            seen = np.concatenate([seen, self._seen(total, weights) & ~self._at_border(coords)])
             self.rounds += 1
         return Field(self.origin, self.voxel, blocks, values, seen)
 
@@ -240,6 +240,14 @@ class _Fusion:
 
     def _in_box(self, coords: np.ndarray) -> np.ndarray:
         return coords[((coords >= np.floor(self.box[0])) & (coords <= self.box[1])).all(1)]
+
+    def _at_border(self, coords: np.ndarray) -> np.ndarray:
+        """Find the samples of blocks that are the outermost ones of the box, (n, 512) bool."""
+        found = np.zeros((len(coords), SIDE, SIDE, SIDE), bool)
+        for end, layer in zip(np.floor(self.box), (0, SIDE - 1), strict=True):
+            for axis in range(3):
+                np.moveaxis(found, axis + 1, 1)[coords[:, axis] == end[axis], layer] = True
+        return found.reshape(-1, SAMPLES)
 
     def _observation(self, index: int) -> Observation:
         if index in self.observations:
@@ -287,7 +295,10 @@ class _Fusion:
         self.reporter.progress(2 * count if self.rounds else count + views, 2 * count + _FILLING)
 
     def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
-        """Return the distances in voxels; unobserved ones are computed from the winding number."""
+        """Return the distances in voxels; unobserved ones are computed from the winding number.
+
+        What reaches the border of the box ends there.
+        """
         values = total / np.maximum(weights, 1e-9) / self.voxel
         unsure = weights < _SURE
         reach = self.reach / self.voxel
@@ -295,7 +306,8 @@ class _Fusion:
         closing = np.clip((0.5 - winding.at(coords, unsure)) * size, -reach, reach)
         self.patches.thicken(coords, unsure, 0.8 * self.back / self.voxel, closing)
         share = np.minimum(weights / _SURE, 1)
-        return _nudged(share * values + (1 - share) * closing).astype(np.float32)
+        values = share * values + (1 - share) * closing
+        return _nudged(np.where(self._at_border(coords), np.maximum(values, 0), values))
 
     def _missing(self, blocks: Blocks, values: np.ndarray, fresh: np.ndarray) -> np.ndarray:
         """Find the missing neighbors (n, 3) of blocks that the surface crosses."""
