@@ -323,6 +323,37 @@ def test_occluded_part_does_not_take_colors_of_occluder():
     assert wrong[behind].mean() < 0.03 and np.quantile(wrong, 0.99) < 0.12
 
 
+def test_parts_too_thin_for_photos_get_splat_colors(monkeypatch):
+    def colors(points):
+        return np.where(np.abs(points[:, :1]) > 0.52, np.float32([0.9, 0.1, 0.1]), np.float32([0.1, 0.2, 0.8]))
+
+    monkeypatch.setitem(globals(), "colors_at", colors)
+    rod = trimesh.creation.cylinder(0.012, 3.0, sections=12).subdivide().subdivide().subdivide()
+    rod.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    mesh = trimesh.util.concatenate([trimesh.creation.icosphere(3, 0.5), rod])
+    views = StubViews(mesh, below=True)
+
+    def object_view(index, classes):
+        (depth, face), camera = views.drawn[index], views.cameras[index]
+        _, _, weights = draw_mesh(mesh.vertices, mesh.faces, camera)
+        color = np.zeros((*face.shape, 3), np.float32)
+        color[face >= 0] = colors(
+            np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[face[face >= 0]]], weights[face >= 0])
+        )
+        alpha = (face >= 0).astype(np.float32)
+        return SimpleNamespace(camera=camera, x=0, y=0, depth=depth, alpha=alpha, color=color, visible=alpha)
+
+    views.object_view = object_view
+    surface = surface_of(mesh)
+    uvs = unwrap(surface, 512)
+    texture, _ = bake_texture(surface, uvs, 512, views, [1])
+    texels = find_texels(uvs, 512, 0, 512)
+    points = np.einsum("nij,ni->nj", mesh.vertices[mesh.faces[texels.face]], texels.weights)
+    wrong = np.abs(texture.reshape(-1, 3)[texels.indices] / 255 - colors(points)).max(1) > 0.3
+    # The rod is 1.2 pixels wide; with colors of the ball, 95% are wrong.
+    assert wrong[np.abs(points[:, 0]) > 0.6].mean() < 0.3
+
+
 def test_unseen_texels_get_splat_colors_and_baking_stops():
     mesh = trimesh.creation.icosphere(2, 1.0)
     views = StubViews(mesh, view_count=6)

@@ -25,6 +25,11 @@ _USED = 0.5
 _AT_ONCE = 4_000_000
 """Largest number of texels that are processed together, to limit memory usage."""
 
+_KNOWN = 1e-6
+"""Smallest weight of a vertex's color."""
+_SHOWN = 1.0
+"""Weight from which on the color of splats replaces that of photos: one view from the front, or several at a slant."""
+
 _EMPTY, _SEEN, _UNSEEN = 0, 1, 2
 """State of a texel: not on the surface; visible in a photo; on the surface, but visible in no photo."""
 
@@ -75,7 +80,8 @@ def bake_texture(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bake the photos into a texture.
 
-    Each texel is blended from the photos that show it best; texels that are visible in no photo are extrapolated.
+    Each texel is blended from the photos that show it best. Texels that are visible in no photo get the colors of the
+    splats there; where these are hardly seen, too, colors are extrapolated.
 
     Args:
         surface: The surface in scene units.
@@ -121,6 +127,10 @@ def bake_texture(
         state.ravel()[texels.indices] = np.where(seen, _SEEN, _UNSEEN)
         _add_texels(faces, texels.face, texels.weights, color, seen, photo_colors.total, photo_colors.weight)
     vertex_colors = _extrapolate(splats, vertices, faces, np.full(3, 0.5, np.float32))
+    # What no photo may color, such as thin parts, has the color of its splats where these are seen.
+    of_splats = (photo_colors.weight <= _KNOWN) & (splats.weight > _SHOWN)
+    photo_colors.total[of_splats] = vertex_colors[of_splats]
+    photo_colors.weight[of_splats] = 1
     base = _extrapolate(photo_colors, vertices, faces, vertex_colors)
     _complete(texture, state, base, faces, uvs, steps)
     return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
@@ -200,7 +210,7 @@ def _extrapolate(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise
 
     otherwise: (3,) or (V, 3), the default colors if no vertex has a mean.
     """
-    known = mean.weight > 1e-6
+    known = mean.weight > _KNOWN
     out = np.empty((len(vertices), 3), np.float32)
     out[:] = otherwise
     if not known.any():
