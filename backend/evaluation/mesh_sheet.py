@@ -22,6 +22,8 @@ from .images import load_font, shorten
 from .meshes import sample_texture
 
 MESHES_SHOWN = 24
+TEXELS_SHOWN = 1024
+"""Width of a texture that suffices for a panel."""
 _CELL = 236
 _PIXELS = 1_260_000
 """Largest total number of pixels of all panels, to limit the file size; a panel is at most _CELL wide."""
@@ -75,11 +77,13 @@ def view_of(capture: Capture, ids: Sequence[int] | None, indices: Sequence[int])
     Raises:
         InputError: A mask cannot be read.
     """
-    sampled = list(indices)[:: max(1, len(indices) // _MAX_SAMPLED_VIEWS)]
-    best, most = sampled[0], -1
-    for index in sampled:
+    best, most = indices[0], 0
+    for index in indices[:: max(1, len(indices) // _MAX_SAMPLED_VIEWS)]:
+        # A mask that shows none of them need not be read.
+        if ids is None or set(ids).isdisjoint(capture.ids_in(index)):
+            continue
         mask = capture.mask(index)
-        pixels = 0 if mask is None or ids is None else int(np.isin(mask, ids).sum())
+        pixels = 0 if mask is None else int(np.isin(mask, ids).sum())
         if pixels > most:
             best, most = index, pixels
     return capture.views[best]

@@ -16,6 +16,7 @@ import torch
 from PIL import Image
 
 from backend.capture import load_capture
+from backend.commands.training import report
 from backend.evaluation.mesh_shape import self_intersecting, shape_of
 from backend.evaluation.mesh_sheet import Card, camera_for, draw_card, mesh_sheet, save_sheet, view_of
 from backend.evaluation.meshes import (
@@ -523,6 +524,24 @@ def test_view_with_most_pixels_is_chosen(true_capture):
     pixels = [(ids == 5).sum() for ids in scene.ids]
     assert view_of(capture, [5], range(9)).name == capture.views[int(np.argmax(pixels))].name
     assert view_of(capture, None, [3, 4]).name == capture.views[3].name
+
+
+def test_only_masks_that_show_a_mesh_are_read_for_its_view(true_capture, monkeypatch):
+    capture, _ = true_capture
+    read, mask = [], capture.mask
+    monkeypatch.setattr(capture, "mask", lambda index: read.append(index) or mask(index))
+    monkeypatch.setattr(capture, "ids_in", lambda index: (0, 5) if index in (4, 6) else (0, 1))
+    view_of(capture, None, range(9))
+    assert not read
+    view_of(capture, [5, 7], range(9))
+    assert read == [4, 6]
+
+
+def test_sheet_keeps_no_more_of_textures_than_it_shows():
+    texture = np.arange(4096, dtype=np.uint16).astype(np.uint8)[:, None, None] + np.zeros((4096, 4096, 3), np.uint8)
+    shown = report._shown_texels(texture)
+    assert shown.shape == (1024, 1024, 3) and shown.base is None and (shown[:, 0] == texture[::4, 0]).all()
+    assert report._shown_texels(texture[:1000, :1000]).shape == (1000, 1000, 3)
 
 
 def test_panels_show_surface_wires_unobserved_faces_and_texture(true_capture):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ...capture import Capture
 from ...evaluation import comparison, write_report
-from ...evaluation.mesh_sheet import MESHES_SHOWN, Card, mesh_sheet, summarize_figures, view_of
+from ...evaluation.mesh_sheet import MESHES_SHOWN, TEXELS_SHOWN, Card, mesh_sheet, summarize_figures, view_of
 from ...evaluation.meshes import digest, mesh_entries, read_texture
 from ...export import ExactSplats
 from ...model.draw import draw
@@ -136,16 +136,21 @@ def _mesh_name(capture: Capture, key: str, mesh: dict[str, Any]) -> str:
 
 def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: Reporter) -> Image.Image | None:
     """Draw the overview image of the meshes; return None if there are none."""
+    if not meshes:
+        return None
     capture, folder = trained.capture, trained.folder.meshes
     cards = []
+    reporter.begin("meshes", "Drawing the meshes")
     if len(meshes) > MESHES_SHOWN:
         reporter.status(f"The image of the meshes shows the first {MESHES_SHOWN} of {len(meshes)}")
     for key, mesh in list(meshes.items())[:MESHES_SHOWN]:
+        reporter.check()
         card = Card(_mesh_name(capture, key, mesh), summarize_figures(mesh), why=mesh.get("why") or "")
         if mesh.get("file") and not card.why:
             try:
                 card.mesh = read_mesh(folder / mesh["file"])
-                card.texture = read_texture(folder / card.mesh.texture) if card.mesh.texture else None
+                if card.mesh.texture:
+                    card.texture = _shown_texels(read_texture(folder / card.mesh.texture))
                 card.view = view_of(capture, mesh["ids"], capture.train_indices)
             except InputError as error:
                 reporter.warning(str(error))
@@ -154,10 +159,13 @@ def _mesh_sheet(trained: Trained, meshes: dict[str, dict[str, Any]], reporter: R
                 if not len(card.mesh.faces) or not np.isfinite(card.mesh.vertices).all():
                     card = Card(card.name, "", why="it has no surface")
         cards.append(card)
-    if not cards:
-        return None
-    reporter.begin("meshes", "Drawing the meshes")
     return mesh_sheet(cards, reporter)
+
+
+def _shown_texels(texture: np.ndarray) -> np.ndarray:
+    """Return a copy of a texture (S, S, 3) without the texels that its panel is too small for."""
+    step = max(1, len(texture) // TEXELS_SHOWN)
+    return texture[::step, ::step].copy()
 
 
 def _sample_images(trained: Trained, reporter: Reporter) -> list[tuple[str, Image.Image]]:
