@@ -229,9 +229,13 @@ def test_object_without_surface_is_reported(trained, run_command, monkeypatch):
     result = run_command("mesh", trained, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["without"] == 1
     assert result.messages("warning") == ["No view shows sphere 2."] == [entries(trained)["2"]["why"]]
+    again = run_command("mesh", trained, "--json").messages("status")
+    assert "2 of 3 meshes exist already" in again and "1 of 3 meshes cannot be made; --restart tries again" in again
     Stub(monkeypatch, without={"1", "2", "5"})
     assert_rejected(run_command("mesh", trained, "--restart", "--objects", "2"), "No view shows sphere 2.")
-    assert run_command("mesh", trained, "--objects", "2", "--json").events[-1]["nothing_made"] is True
+    result = run_command("mesh", trained, "--objects", "2", "--json")
+    assert result.events[-1]["nothing_made"] is True
+    assert not any("exist already" in message for message in result.messages("status"))
 
 
 def test_missing_surface_removes_earlier_mesh(trained, run_command, monkeypatch):

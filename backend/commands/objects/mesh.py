@@ -94,8 +94,12 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             trained.scene.capture = with_corrected_masks(trained, reporter)
             model = model_of_discs(trained, options, reporter)
         reporter.begin("meshes", "Reading the photos")
-        if len(wanted) < len(targets):
-            reporter.status(f"{len(targets) - len(wanted)} of {len(targets)} meshes exist already")
+        current = [known[target.key] for target in targets if target not in wanted]
+        existing = sum(entry.file is not None for entry in current)
+        if existing:
+            reporter.status(f"{existing} of {len(targets)} meshes exist already")
+        if len(current) > existing:
+            reporter.status(f"{len(current) - existing} of {len(targets)} meshes cannot be made; --restart tries again")
         started = time.monotonic()
         # Renders and photos share the memory; a pixel takes about four times as many bytes in the former.
         trained.scene.forget(1 - _FOR_RENDERS)
