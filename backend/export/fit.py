@@ -36,7 +36,8 @@ MAX_VIEWS = 200
 RIDGE = 0.002
 """Regularization of the higher bands for splats with few views, as a fraction of the total weight of the views."""
 
-_ANCHORS_AT_ONCE = 50_000
+_ANCHORS_AT_ONCE = 150_000
+"""Number of anchors for which every view is rendered; the sums of an offset take about 330 bytes."""
 _SPLATS_AT_ONCE = 50_000
 _SMALLEST = 1e-9
 _UPPER = np.triu_indices((SH_DEGREE + 1) ** 2)
@@ -137,6 +138,7 @@ class _Sums:
     def __init__(self, model: ObjectModel, start: int, stop: int) -> None:
         self.model = model
         self.k = model.anchors.layout.offsets
+        self.start, self.stop = start, stop
         self.first = start * self.k
         n = (stop - start) * self.k
         self.weight = np.zeros(n, np.float32)
@@ -150,6 +152,8 @@ class _Sums:
         """Add the view of one camera."""
         model = self.model
         seen = _anchors_in_view(model, camera)
+        if not ((seen >= self.start) & (seen < self.stop)).any():
+            return
         g = model.generate(seen, camera.center)
         # The gradient of the image's sum with respect to a splat's color is the number of pixels it covers.
         black = torch.zeros_like(g.sh).requires_grad_()

@@ -13,7 +13,7 @@ import torch
 
 from backend.commands.exported import export_model
 from backend.commands.training import train
-from backend.export import ExactSplats, FittedSplats
+from backend.export import ExactSplats, FittedSplats, fit
 from backend.model.anchors import Anchors, Layout, seed_anchors
 from backend.model.heads import Heads
 from backend.model.object_model import Normalization, ObjectModel
@@ -68,6 +68,21 @@ def test_export_takes_little_memory(tmp_path, monkeypatch, focal, most):
     tracemalloc.stop()
     # All splats would take 133 bytes each; only those in view are compared with the model.
     assert peak < most * len(read_vertices(folder.splats))
+
+
+def test_fit_renders_only_views_that_see_the_part(monkeypatch):
+    model = model_of(100, "view")
+    model.anchors.positions[50:] -= torch.tensor([0.0, 0.0, 100.0])
+    monkeypatch.setattr(OF_FIT[0], 50)
+    rendered, rasterize = [], fit.rasterize
+    monkeypatch.setattr(fit, "rasterize", lambda *args, **named: rendered.append(args[6]) or rasterize(*args, **named))
+    K = np.array([[64.0, 0, 32], [0, 64.0, 24], [0, 0, 1]])
+    forward, backward = np.diag([1.0, 1, 1, 1]), np.diag([-1.0, 1, -1, 1])
+    forward[2, 3], backward[2, 3] = 3, -97
+    cameras = [Camera(viewmat, K, 64, 48) for viewmat in (forward, backward)]
+    _, source = fit.fit_splats(model, cameras)
+    assert [camera is cameras[1] for camera in rendered] == [False, True]
+    assert source.min() < 500 <= source.max()
 
 
 @pytest.mark.parametrize("primitive", ["3d", "2d"])
