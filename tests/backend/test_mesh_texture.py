@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 
+from backend.commands.objects.mesh import _unwrapped
 from backend.mesh.refine import refine
 from backend.mesh.surface import Surface
 from backend.mesh.texture.atlas import fill, find_texels
@@ -418,3 +419,17 @@ def test_texture_size_follows_photo_resolution():
             for c in StubViews(mesh, view_count=7, size=80).cameras
         ]
         assert texture_size(surface_of(mesh), views) == size
+
+
+def test_texture_of_a_long_object_is_as_fine_as_its_photos():
+    mesh = trimesh.creation.box((1.6, 0.1, 0.04)).subdivide().subdivide().subdivide()
+    views = StubViews(mesh, view_count=7, size=16)
+    views.cameras = [
+        Camera(c.viewmat, np.diag([100.0, 100.0, 1.0]) @ c.K, c.width * 100, c.height * 100) for c in views.cameras
+    ]
+    surface = surface_of(mesh)
+    assert texture_size(surface, views) == 512
+    uvs, size = _unwrapped(surface, views, None)
+    assert size == 1024 and areas(uvs).sum() < 0.3
+    np.testing.assert_array_equal(uvs, unwrap(surface, 1024))
+    assert _unwrapped(surface, views, 512)[1] == 512

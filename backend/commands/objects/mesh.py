@@ -176,8 +176,7 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         )
     surface = refine(surface, views, classes.tolist(), part.step("refine"))
     part.step("unwrap")
-    size = options.texture_size or texture_size(surface, views)
-    uvs = unwrap(surface, size)
+    uvs, size = _unwrapped(surface, views, options.texture_size)
     texture, colors = bake_texture(surface, uvs, size, views, classes.tolist(), reporter=part.step("bake"))
     stem = _stem(target.key)
     _write_image(folder / f"{stem}.png", texture)
@@ -191,6 +190,16 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
         "seconds": round(time.monotonic() - started, 2),
     }
     return replace(entry, file=f"{stem}.ply", texture=f"{stem}.png", figures=figures)
+
+
+def _unwrapped(surface: Surface, views: Views, size: int | None) -> tuple[np.ndarray, int]:
+    """Return the UVs of a surface, and the size of its texture, chosen if `size` is None."""
+    if size:
+        return unwrap(surface, size), size
+    size = texture_size(surface, views)
+    uvs = unwrap(surface, size)
+    needed = texture_size(surface, views, uvs)
+    return (unwrap(surface, needed), needed) if needed > size else (uvs, size)
 
 
 def _lacking(surface: Surface, model: ObjectModel, classes: np.ndarray) -> list[int]:

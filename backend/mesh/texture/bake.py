@@ -20,7 +20,7 @@ from .photos import Photo, Photos, Samples, add_photo, blend
 SIZES = (512, 1024, 2048, 4096)
 
 _USED = 0.5
-"""Approximate fraction of a texture that is covered by charts."""
+"""Common fraction of a texture that is covered by charts; with long ones, it is much less."""
 
 _AT_ONCE = 4_000_000
 """Largest number of texels that are processed together, to limit memory usage."""
@@ -34,12 +34,13 @@ _EMPTY, _SEEN, _UNSEEN = 0, 1, 2
 """State of a texel: not on the surface; visible in a photo; on the surface, but visible in no photo."""
 
 
-def texture_size(surface: Surface, views: Views) -> int:
+def texture_size(surface: Surface, views: Views, uvs: np.ndarray | None = None) -> int:
     """Choose the size of a texture.
 
     Args:
         surface: The surface in scene units.
         views: The training views.
+        uvs: (F, 3, 2) from `unwrap`, for the fraction of the texture that they cover; None: a common one.
 
     Returns:
         The smallest of SIZES for which, on most of the surface, texels are not larger than pixels of the closest view.
@@ -66,7 +67,11 @@ def texture_size(surface: Surface, views: Views) -> int:
     order = np.argsort(finest[seen])
     reached = np.cumsum(area[seen][order]) / max(float(area[seen].sum()), 1e-30)
     density = finest[seen][order][min(int(np.searchsorted(reached, 0.8)), len(order) - 1)]
-    needed = np.sqrt(density * area.sum() / _USED)
+    used = _USED
+    if uvs is not None:
+        along, away = np.moveaxis(uvs[:, 1:].astype(np.float64) - uvs[:, :1], 1, 0)
+        used = max(float(np.abs(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]).sum()) / 2, 1e-9)
+    needed = np.sqrt(density * area.sum() / used)
     return next((size for size in SIZES if size >= needed), SIZES[-1])
 
 
