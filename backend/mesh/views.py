@@ -32,7 +32,6 @@ class SceneMap:
         depth_uncertainty: (H, W) float32, expected error of the depth in scene units.
         ids: (H, W) int32, class index of the most probable object, -1 where nothing is drawn.
         probability: (H, W) float32, probability of that object.
-        alpha: (H, W) float32.
     """
 
     camera: Camera
@@ -40,7 +39,6 @@ class SceneMap:
     depth_uncertainty: np.ndarray
     ids: np.ndarray
     probability: np.ndarray
-    alpha: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -74,23 +72,14 @@ class Views:
         model: The trained model.
         scene: The scene with the cameras and photos.
         indices: The views to use.
-        downscale: The factor by which renders are smaller than the photos.
         memory_mb: Memory limit of the cache of renders. Object views, and the scene maps used beside them, are cached
             until other objects are requested; then the maps that were not used for longest make way for others.
     """
 
-    def __init__(
-        self,
-        model: ObjectModel,
-        scene: Scene,
-        indices: Sequence[int],
-        downscale: int = 1,
-        memory_mb: float = 600,
-    ) -> None:
+    def __init__(self, model: ObjectModel, scene: Scene, indices: Sequence[int], memory_mb: float = 600) -> None:
         self.model = model
         self.scene = scene
         self.indices = tuple(indices)
-        self.downscale = downscale
         self._room = memory_mb * 1e6
         self._maps: OrderedDict[int, SceneMap] = OrderedDict()
         self._used: set[int] = set()
@@ -101,12 +90,7 @@ class Views:
 
     def camera(self, index: int) -> Camera:
         """Return the camera of view `index` in scene units."""
-        return self.scene.camera(index, self.downscale)
-
-    def splats(self, classes: Sequence[int]) -> Generated:
-        """Return the Gaussians of the objects `classes` in scene units; if view-dependent, generated for the origin."""
-        self._turn_to(classes)
-        return self._own_splats(None)
+        return self.scene.camera(index)
 
     def scene_map(self, index: int) -> SceneMap:
         """Render the whole scene in view `index`."""
@@ -117,8 +101,7 @@ class Views:
         camera = self.camera(index)
         drawn = self._draw(self._scene_splats(camera), camera)
         ids, probability = (devices.host(plane) for plane in object_map(drawn))
-        alpha = devices.host(drawn.alpha)
-        found = SceneMap(camera, *self._depth(drawn), ids, probability, alpha)
+        found = SceneMap(camera, *self._depth(drawn), ids, probability)
         if self._take(_bytes(found)):
             self._maps[index] = found
         return found
@@ -157,7 +140,7 @@ class Views:
         the background there. If the mask contains the objects, these pixels are not part of them.
         """
         camera = self.camera(index)
-        mask = self.scene.capture.mask(index, self.downscale)
+        mask = self.scene.capture.mask(index)
         known = self.model.classes.ids_of([c for c in self._classes if c])
         if mask is None or len(known) < len(self._classes) or not np.isin(mask, known).any():
             return np.ones((camera.height, camera.width), bool)
@@ -204,16 +187,16 @@ class Views:
             self._all = self.model.generate()
         return self._all
 
-    def _own_splats(self, camera: Camera | None) -> Generated:
+    def _own_splats(self, camera: Camera) -> Generated:
         if self._own is not None:
             return self._own
         if self.model.explicit:
-            splats = self._scene_splats(self.camera(self.indices[0]))
+            splats = self._scene_splats(camera)
             self._own = splats.select(self._are_ours(splats.ids) & self.scene.before_surroundings(splats.means))
             return self._own
         ours = self._are_ours(self.model.anchors.ids) & self.scene.before_surroundings(self.model.anchors.positions)
         anchors = ours.nonzero()[:, 0]
-        return self.model.generate(anchors, np.zeros(3) if camera is None else camera.center)
+        return self.model.generate(anchors, camera.center)
 
     def _are_ours(self, ids: torch.Tensor) -> torch.Tensor:
         """Return which of the class indices `ids` belong to the current objects, bool."""

@@ -70,9 +70,9 @@ def views_of(splats, cameras, explicit=True, mask=None, primitive="3d", **option
     anchors = SimpleNamespace(ids=splats.ids, positions=splats.means)
     model = SimpleNamespace(generate=generate, explicit=explicit, primitive=primitive, anchors=anchors)
     model.classes = ClassTable([0, 10, 20])
-    capture = SimpleNamespace(mask=lambda index, downscale: mask)
+    capture = SimpleNamespace(mask=lambda index: mask)
     scene = SimpleNamespace(
-        camera=lambda index, downscale: cameras[index], capture=capture,
+        camera=lambda index: cameras[index], capture=capture,
         before_surroundings=lambda positions: torch.ones(len(positions), dtype=torch.bool),
     )  # fmt: skip
     return Views(model, scene, range(len(cameras)), **options)
@@ -287,7 +287,7 @@ class ExactViews:
         hit = np.isfinite(nearest)
         ids = np.where(hit, depths.argmin(0), -1).astype(np.int32)
         one = hit.astype(np.float32)
-        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), 0 * one, ids, one, one)
+        return SceneMap(self.cameras[index], np.where(hit, nearest, 0).astype(np.float32), 0 * one, ids, one)
 
     def object_view(self, index, classes):
         depth = self.depths(index)[list(classes)].min(0)

@@ -170,7 +170,6 @@ class StubViews:
     """Photos of a mesh of known colors (class 1), partly hidden by another mesh of one loud color (class 2)."""
 
     def __init__(self, mesh, other=None, view_count=24, size=160, masks=True, below=False):
-        self.downscale = 1
         self.model = SimpleNamespace(classes=ClassTable([0, 7, 9]))
         self.scene = self
         angles = np.arange(view_count) * 2.4
@@ -209,7 +208,7 @@ class StubViews:
         depth, face, _ = draw_mesh(mesh.vertices, mesh.faces, camera)
         return image, label[1::2, 1::2].astype(np.int32), (depth, face)
 
-    def camera(self, index, downscale=1):
+    def camera(self, index):
         return self.cameras[index]
 
     def target(self, index, downscale=1):

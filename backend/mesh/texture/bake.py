@@ -188,9 +188,8 @@ def _add_splats(
     at = np.flatnonzero(seen)
     nearest = photo.depth[row[at], column[at]]
     at = at[depth[at] <= nearest * 1.01]
-    # The object view may be downscaled, and covers a different rectangle.
-    column = (column[at] + photo.x) // views.downscale - view.x
-    row = (row[at] + photo.y) // views.downscale - view.y
+    # The object view covers a different rectangle.
+    column, row = column[at] + photo.x - view.x, row[at] + photo.y - view.y
     inside = (column >= 0) & (row >= 0) & (column < view.alpha.shape[1]) & (row < view.alpha.shape[0])
     at, column, row = at[inside], column[inside], row[inside]
     weight = facing[at] ** 2 * view.alpha[row, column] * (view.visible[row, column] + 1e-3)

@@ -145,10 +145,7 @@ def _allowed(
         # A mask that contains the objects is assumed to be complete.
         if not unlabeled.any() or (shown.any() and 0 not in classes):
             return shown[y : y + height, x : x + width]
-    ids = views.scene_map(index).ids
-    rows = np.minimum((np.arange(height) + y) // views.downscale, ids.shape[0] - 1)
-    columns = np.minimum((np.arange(width) + x) // views.downscale, ids.shape[1] - 1)
-    modeled = ours[ids[rows[:, None], columns]]
+    modeled = ours[views.scene_map(index).ids[y : y + height, x : x + width]]
     return modeled if labels is None else np.where(unlabeled, modeled, shown[y : y + height, x : x + width])
 
 
