@@ -17,7 +17,7 @@ from scipy.sparse.linalg import cg
 
 from ..raster.kernel import kernel
 from ..shared.events import Reporter
-from .surface import Surface, neighbors, vertex_normals
+from .surface import Surface, neighbors, vertex_normals, without_folds
 from .texture.photos import Photo, Photos, look
 from .views import Views
 
@@ -39,10 +39,6 @@ _NONE = 255
 _NOISE = (2.5 / 255) ** 2
 _STIFFNESS = 3.0
 _DAMPING = 0.05
-_TURN = 0.5
-"""Cosine of the largest angle by which a face may rotate."""
-
-_UNFOLDED = 40
 _SHARED = 3
 """Number of rounds in which the costs of patches are averaged over neighbors."""
 
@@ -109,28 +105,7 @@ def _moved(
             )  # fmt: skip
         _disagreement(patches, cost[block])
     displacement = (_settled(cost, offsets, near) * pixel)[:, None] * normals
-    return vertices + _without_folds(vertices, faces, displacement, mean)
-
-
-def _without_folds(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray, mean: csr_matrix) -> np.ndarray:
-    """Smooth `displacement` (V, 3) of the vertices where faces would fold over."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    before = np.cross(b - a, c - a)
-    even = mean.copy()
-    even.data = 1 / np.repeat(np.maximum(np.diff(even.indptr), 1), np.diff(even.indptr))
-    for round in range(_UNFOLDED):
-        a, b, c = np.moveaxis((vertices + displacement)[faces], 1, 0)
-        after = np.cross(b - a, c - a)
-        least = _TURN * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-        folded = (before * after).sum(1) < least
-        if not folded.any():
-            break
-        near = np.zeros(len(vertices))
-        near[faces[folded]] = 1
-        for _ in range(1 + round // 4):
-            near = near + even @ near
-        displacement = np.where(near[:, None] > 0, (displacement + even @ displacement) / 2, displacement)
-    return displacement
+    return vertices + without_folds(vertices, faces, displacement)
 
 
 def _seen_by(photo: Photo) -> tuple[np.ndarray, ...]:

@@ -7,6 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
+_TURN = 0.5
+"""Cosine of the largest angle by which a face may rotate where vertices move."""
+_UNFOLDED = 40
+"""Largest number of rounds in which displacements are smoothed where faces rotate more."""
+
 
 @dataclass
 class Surface:
@@ -58,6 +63,27 @@ def neighbors(vertices: np.ndarray, faces: np.ndarray) -> csr_matrix:
     length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     ties = 1 / np.maximum(length, 1e-3 * max(float(length.mean()), 1e-30))
     return coo_matrix((ties, (edges[:, 0], edges[:, 1])), (len(vertices), len(vertices))).tocsr()
+
+
+def without_folds(vertices: np.ndarray, faces: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Return `displacement` (V, 3) of the vertices (V, 3), smoothed where faces (F, 3) would fold over."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    before = np.cross(b - a, c - a)
+    even = neighbors(vertices, faces)
+    even.data = 1 / np.repeat(np.maximum(np.diff(even.indptr), 1), np.diff(even.indptr))
+    for round in range(_UNFOLDED):
+        a, b, c = np.moveaxis((vertices + displacement)[faces], 1, 0)
+        after = np.cross(b - a, c - a)
+        least = _TURN * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        folded = (before * after).sum(1) < least
+        if not folded.any():
+            break
+        near = np.zeros(len(vertices))
+        near[faces[folded]] = 1
+        for _ in range(1 + round // 4):
+            near = near + even @ near
+        displacement = np.where(near[:, None] > 0, (displacement + even @ displacement) / 2, displacement)
+    return displacement
 
 
 class NoSurface(Exception):

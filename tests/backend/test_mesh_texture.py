@@ -11,6 +11,7 @@ import trimesh
 
 from backend.commands.objects.mesh import _unwrapped
 from backend.mesh.refine import refine
+from backend.mesh.smooth import smooth
 from backend.mesh.surface import Surface
 from backend.mesh.texture.atlas import fill, find_texels
 from backend.mesh.texture.bake import bake_texture, texture_size
@@ -406,6 +407,48 @@ def test_refinement_keeps_surface_without_texture():
     np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
     views.indices = ()
     np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
+
+
+def face_normals(vertices, faces):
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    across = np.cross(b - a, c - a)
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("shape", ["box", "sphere"])
+def test_smoothing_removes_bumps_and_keeps_edges_and_size(shape):
+    mesh = trimesh.creation.box((2, 2, 2)) if shape == "box" else trimesh.creation.icosphere(4, 1.0)
+    while len(mesh.faces) < 5000:
+        mesh = mesh.subdivide()
+    surface = surface_of(mesh)
+    edge = np.linalg.norm(
+        mesh.vertices[mesh.edges_unique[:, 0]] - mesh.vertices[mesh.edges_unique[:, 1]], axis=1
+    ).mean()
+    noise = np.random.default_rng(0).normal(0, 0.15 * edge, len(mesh.vertices))
+    surface.vertices = mesh.vertices + noise[:, None] * mesh.vertex_normals
+    found = smooth(surface)
+    np.testing.assert_array_equal(found.faces, surface.faces)
+
+    def error_of(vertices):
+        """Return the median angle in degrees to the true normals, and the median distance to the true surface."""
+        cosine = (face_normals(vertices, mesh.faces) * face_normals(mesh.vertices, mesh.faces)).sum(1)
+        size = np.abs(vertices).max(1) if shape == "box" else np.linalg.norm(vertices, axis=1)
+        return np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))), np.median(np.abs(size - 1))
+
+    (angle, distance), (before, far) = error_of(found.vertices), error_of(surface.vertices)
+    assert angle < 0.35 * before and distance < far
+    corners = np.abs(np.abs(mesh.vertices) - 1).max(1) < 1e-9
+    if shape == "box":
+        assert np.linalg.norm(found.vertices[corners] - mesh.vertices[corners], axis=1).max() < edge
+    assert np.allclose(smooth(surface_of(mesh)).vertices, mesh.vertices, atol=0.05 * edge)
+
+
+def test_smoothing_takes_open_and_degenerate_surfaces():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 2, 2]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 4, 4], [1, 2, 2]], np.int32)
+    for count in range(len(faces) + 1):
+        surface = Surface(vertices, faces[:count], np.zeros(count, bool))
+        np.testing.assert_allclose(smooth(surface).vertices, vertices, atol=1e-9)
 
 
 def test_texture_size_follows_photo_resolution():

@@ -15,6 +15,7 @@ from PIL import Image
 from ...mesh.field.extract import extract, is_watertight
 from ...mesh.field.fusion import fuse
 from ...mesh.refine import refine
+from ...mesh.smooth import smooth
 from ...mesh.surface import NoSurface, Surface
 from ...mesh.texture.bake import bake_texture, texture_size
 from ...mesh.texture.unwrap import unwrap
@@ -174,7 +175,7 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
             f"The mesh of {target.name} lacks {first}{more}, separate from the rest and small, or hardly seen; make a "
             "mesh of each alone."
         )
-    surface = refine(surface, views, classes.tolist(), part.step("refine"))
+    surface = smooth(refine(surface, views, classes.tolist(), part.step("refine")))
     part.step("unwrap")
     uvs, size = _unwrapped(surface, views, options.texture_size)
     texture, colors = bake_texture(surface, uvs, size, views, classes.tolist(), reporter=part.step("bake"))
