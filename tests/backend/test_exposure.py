@@ -1,5 +1,6 @@
 """Estimated gains of photos with varying exposure, against known gains."""
 
+import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -65,6 +66,40 @@ def test_few_of_many_observations_suffice(monkeypatch):
     assert all(len(points) == 2000 and (np.bincount(points)[::4] == 8).all() for points in used)
 
 
+def test_photos_with_few_points_keep_them(monkeypatch):
+    truth = np.exp(np.random.default_rng(1).normal(0, 0.15, (8, 3)))
+    views = photos(truth, [1] * 8, points=1000, noise=0.01)
+    every = views.keypoints(0)
+    few = SimpleNamespace(xy=every.xy[:60], point_index=every.point_index[:60])
+    views.keypoints = lambda index: few if index == 5 else every
+    monkeypatch.setattr(of_photos, "_MOST_OBSERVATIONS", 1000)
+    np.testing.assert_allclose(measure_gains(views), truth / np.exp(np.log(truth).mean(0)), rtol=0.01)
+
+
+def test_points_in_many_photos_take_little_memory():
+    """Without a matrix of the photos, which share each point."""
+    views, points = 4000, 20
+    view, point = np.divmod(np.arange(views * points), points)
+    truth = np.random.default_rng(1).normal(0, 0.15, views)
+    tracemalloc.start()
+    found = of_photos._log_gains(view, point, truth[view] + 0.1 * point - 3, views, points, lambda: None)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(found - found.mean(), truth - truth.mean(), atol=1e-3)
+    assert most < 8 * views**2
+
+
+def observing(points, count):
+    """Return a stand-in for a capture of `count` points, of which each view observes those of the indices `points`."""
+    views = range(len(points))
+    return SimpleNamespace(
+        views=views,
+        train_indices=views,
+        points=SimpleNamespace(xyz=np.zeros((count, 3))),
+        keypoints=lambda index: SimpleNamespace(point_index=points[index]),
+    )
+
+
 def orbit(monkeypatch, gains, brightness, wrong=0.0):
     """Return a stand-in for a capture of 60 photos around something, each of whose points 8 neighbors show.
 
@@ -79,7 +114,7 @@ def orbit(monkeypatch, gains, brightness, wrong=0.0):
     seen = colors[np.where(rng.random(len(point)) < wrong, rng.permutation(point), point)]
     seen = np.clip(seen * np.exp(rng.normal(0, 0.05, seen.shape)) * gains[view][:, None], 0, 1)
     monkeypatch.setattr(of_photos, "_observations", lambda _, i, __: (point[view == i], seen[view == i]))
-    return SimpleNamespace(views=range(60), train_indices=range(60), points=SimpleNamespace(xyz=np.zeros((points, 3))))
+    return observing([point[view == i] for i in range(60)], points)
 
 
 def test_exposure_that_changes_along_a_path_is_found(monkeypatch):
@@ -102,8 +137,7 @@ def test_photos_without_common_points_have_no_gain(monkeypatch):
     points = [np.arange(100) + 100 * (i >= 3) for i in range(6)] + [np.arange(200, 300), np.arange(100)]
     seen = [gains[i] * colors[points[i] % 200] for i in range(8)]
     monkeypatch.setattr(of_photos, "_observations", lambda _, i, __: (points[i], seen[i]))
-    views = SimpleNamespace(views=range(8), train_indices=range(8), points=SimpleNamespace(xyz=np.zeros((300, 3))))
-    found = measure_gains(views)
+    found = measure_gains(observing(points, 300))
     assert np.isfinite(found).all() and (found[6] == 1).all() and (found[:, 2] == 1).all()
     np.testing.assert_allclose(found[:3, 0] / found[0, 0], gains[:3] / gains[0], rtol=1e-2)
     np.testing.assert_allclose(found[3:6, 0] / found[3, 0], gains[3:6] / gains[3], rtol=1e-2)

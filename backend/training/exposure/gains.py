@@ -11,8 +11,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import cg
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator, cg
 
 from ...shared.stopping import Check, proceed
 
@@ -23,11 +23,13 @@ VARIES_FROM = 0.02
 """Standard deviation of the log gains above which the exposure is considered to vary."""
 
 _MOST_OBSERVATIONS = 1_000_000
-"""Number of observations, above which every other point is left out repeatedly."""
+"""Number of observations, above which only every other point is used, or fewer."""
 
 _ROUNDS = 8
 _MIN_OBSERVATIONS = 30
 """Fewest observations of a view, of points that other views observe, too, for a gain of its own."""
+_KEPT = 2 * _MIN_OBSERVATIONS
+"""Observations that a view keeps where there are too many in all."""
 _LIMIT = 4.0
 """Largest gain, and inverse of the smallest, relative to the median."""
 _DARKEST = 2 / 255
@@ -57,15 +59,10 @@ def measure_gains(capture: Capture, check: Check = proceed) -> np.ndarray:
     """
     gains = np.ones((len(capture.views), 3))
     observed: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    every, held = 1, 0
+    used = _used_points(capture)
     for i in capture.train_indices:
         check()
-        observed[i] = _observations(capture, i, every)
-        held += len(observed[i][0])
-        while held > _MOST_OBSERVATIONS:
-            every *= 2
-            observed = {view: _of_every(every, *found) for view, found in observed.items()}
-            held = sum(len(points) for points, _ in observed.values())
+        observed[i] = _observations(capture, i, used)
     if not observed:
         return gains
     points, colors = (np.concatenate(found) for found in zip(*observed.values(), strict=True))
@@ -98,14 +95,21 @@ def _log_gains(
         check()
         # Least squares without the colors, which are the means of what the gains leave.
         each = csr_array((weight, (view, point)), (views, points))
-        total = np.maximum(np.bincount(point, weight, points), 1e-9)
-        matrix = (diags_array(each.sum(1) + _PULL) - each @ diags_array(1 / total) @ each.T).tocsr()
         right = np.bincount(view, weight * (logs - _of_groups(logs, point, weight, points)[point]), views)
-        found = cg(matrix, right, found, rtol=1e-6)[0]
+        found = cg(_without_colors(each), right, found, rtol=1e-6)[0]
         left = logs - found[view]
         left -= _of_groups(left, point, weight, points)[point]
         weight = bright / (1 + (left / _DISAGREES) ** 2)
     return found
+
+
+def _without_colors(each: csr_array) -> LinearOperator:
+    """Return the matrix (views, views) of the log gains' equations; each: (views, points), weights of observations.
+
+    It is not computed, since it has an entry for each two views that show a point.
+    """
+    back, own, total = each.T.tocsr(), each.sum(1) + _PULL, np.maximum(each.sum(0), 1e-9)
+    return LinearOperator((len(own),) * 2, lambda gains: own * gains - each @ ((back @ gains) / total), dtype=float)
 
 
 def _of_groups(values: np.ndarray, group: np.ndarray, weight: np.ndarray, groups: int) -> np.ndarray:
@@ -127,22 +131,26 @@ def varies(gains: np.ndarray) -> bool:
     return differences(gains) > VARIES_FROM
 
 
-def _of_every(every: int, points: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices (n,) and colors (n, 3) of the points whose index is a multiple of `every`."""
-    kept = points % every == 0
-    return points[kept], colors[kept]
+def _used_points(capture: Capture) -> np.ndarray:
+    """Return which points (P,) bool are used: of too many, every other one or fewer, and enough of each view."""
+    observed = [capture.keypoints(i).point_index for i in capture.train_indices]
+    every, count = 1, sum(map(len, observed))
+    while count > every * _MOST_OBSERVATIONS:
+        every *= 2
+    used = np.arange(len(capture.points.xyz)) % every == 0
+    for points in observed:
+        if np.count_nonzero(used[points]) < _KEPT:
+            used[points[:: max(len(points) // _KEPT, 1)]] = True
+    return used
 
 
-def _observations(capture: Capture, index: int, every: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points observed in a view: indices (n,), and colors (n, 3) in [0, 1], averaged over 3 x 3 pixels.
-
-    Only those whose index is a multiple of `every`.
-    """
+def _observations(capture: Capture, index: int, used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points `used` (P,) in a view: indices (n,), colors (n, 3) in [0, 1], averaged over 3 x 3 pixels."""
     keypoints = capture.keypoints(index)
     pixels = capture.image(index)
     height, width = pixels.shape[:2]
     x, y = np.floor(keypoints.xy).astype(np.int64).T
-    inside = (x >= 1) & (y >= 1) & (x < width - 1) & (y < height - 1) & (keypoints.point_index % every == 0)
+    inside = (x >= 1) & (y >= 1) & (x < width - 1) & (y < height - 1) & used[keypoints.point_index]
     x, y = x[inside], y[inside]
     color = np.zeros((len(x), 3))
     for dx in (-1, 0, 1):
