@@ -13,7 +13,8 @@ import pycolmap
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import replace_file, write_atomic
-from ..shared.formats.photos_source import FORMER, SOURCE, WORK
+from ..shared.formats.photos_source import SOURCE, WORK
+from ..shared.photos.former_model import forget_former, keep_former, put_former_back
 from . import database
 from .agreement import Agreement, measure_agreement
 
@@ -180,37 +181,21 @@ def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
 
 @contextmanager
 def former_on_error(capture: Path) -> Iterator[None]:
-    """Put the present sparse/0 and sfm/source.json of a capture back, or remove a new model, on any exception.
-
-    After a run that was killed, those that it has replaced are put back.
-    """
-    # Not beside the model, where it would be another one of the capture.
-    target, former, source = capture / SPARSE, capture / WORK / FORMER, capture / WORK / SOURCE
-    part = former.with_name(f"{FORMER}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    if target.exists() and not former.exists():
-        shutil.copytree(target, part)
-        if source.exists():
-            shutil.copyfile(source, part / SOURCE)
-        replace_file(part, former)
-    made_from = next((path.read_bytes() for path in (former / SOURCE, source) if path.exists()), None)
+    """Put the present sparse/0 and sfm/source.json of a capture back, or remove a new model, on any exception."""
+    target, source = capture / SPARSE, capture / WORK / SOURCE
+    has_former, made_from = target.exists(), source.read_bytes()
+    if has_former:
+        keep_former(capture)
     try:
         yield
     except BaseException:
-        old = target.with_name("old")
-        shutil.rmtree(old, ignore_errors=True)
-        if target.exists():
-            replace_file(target, old)
-        if former.exists():
-            (former / SOURCE).unlink(missing_ok=True)
-            replace_file(former, target)
-        shutil.rmtree(old, ignore_errors=True)
-        if made_from is not None:
+        if has_former:
+            put_former_back(capture)
+        else:
+            shutil.rmtree(target, ignore_errors=True)
             write_atomic(source, made_from)
         raise
-    if former.exists():
-        replace_file(former, part)
-        shutil.rmtree(part, ignore_errors=True)
+    forget_former(capture)
 
 
 def reasons(path: Path, names: Sequence[str], posed: Iterable[str], wrong: Iterable[str]) -> Mapping[str, str]:

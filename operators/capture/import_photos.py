@@ -9,6 +9,7 @@ from bpy.props import CollectionProperty, EnumProperty, IntProperty, StringPrope
 
 from ...backend.shared.errors import InputError
 from ...backend.shared.formats.photos_source import PHOTOS, VIDEOS, PhotosSource, has_poses
+from ...backend.shared.photos.former_model import undo_killed_run
 from ...backend.shared.photos.source_files import has_poses_of
 from ...objectgs_addon.blender import messages
 from ...objectgs_addon.environment import locations
@@ -97,6 +98,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         )
         again = {"operator": "objectgs.recompute_poses", "label": "Compute Poses Again", "capture": str(capture)}
         messages.settle("", again["operator"], capture=again["capture"])
+        undo_killed_run(capture)
         if has_poses_of(capture, wanted):
             job = background.import_job(capture)
             need.require_unused(job.folder)

@@ -32,6 +32,7 @@ from backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, Can
 from backend.shared.events import Reporter
 from backend.shared.formats import photos_source
 from backend.shared.photos import source_files
+from backend.shared.photos.former_model import keep_former
 
 from .command_result import assert_rejected
 from .rendered_photos import HEIGHT, VIEWS, WIDTH, photo, pose, pose_errors, ring, write_photos
@@ -221,16 +222,19 @@ def test_stop_at_the_end_leaves_the_earlier_model(made, photos, tmp_path, monkey
     assert (out / "sfm" / "sfm.json").read_bytes() == report
 
 
-def test_stop_after_a_killed_run_leaves_the_model_before_both(made, photos, tmp_path):
+def test_stop_after_a_killed_run_leaves_the_model_before_both(made, photos, tmp_path, monkeypatch, run_command):
     out, wanted = shutil.copytree(made, tmp_path / "capture"), photos_source.PhotosSource([photos])
     before, source = (path.read_bytes() for path in (out / "sparse/0/images.bin", out / "sfm/source.json"))
-    killed = former_on_error(out)
-    killed.__enter__()
+
+    def stopped(*_):
+        raise Cancelled("Stopped")
+
+    keep_former(out)
     (out / "sparse/0/images.bin").write_bytes(b"half-made")
     photos_source.write_source(out, replace(wanted, leave_out=["photo 7.png"]))
     assert not source_files.has_poses_of(out, wanted)
-    with pytest.raises(Cancelled), former_on_error(out):
-        raise Cancelled("Stopped")
+    monkeypatch.setattr(sfm_command, "match_photos", stopped)
+    assert run_command("sfm", photos, "--out", out).code == EXIT_CANCELLED
     assert (out / "sparse/0/images.bin").read_bytes() == before and (out / "sfm/source.json").read_bytes() == source
     assert source_files.has_poses_of(out, wanted)
     assert {path.name for path in (out / "sparse/0").iterdir()} == {path.name for path in (made / "sparse/0").iterdir()}

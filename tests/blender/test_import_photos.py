@@ -13,6 +13,7 @@ bpy = pytest.importorskip("bpy")
 
 import objectgs as extension
 from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
+from objectgs.backend.shared.photos.former_model import keep_former
 from objectgs.backend.shared.photos.source_files import digest_of_files, has_poses_of
 from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_record
@@ -185,6 +186,16 @@ def test_photos_with_poses_are_imported_as_they_are(submitted, computed, shown, 
     update_record(Reconstruction(job.folder), capture=CaptureRecord(str(computed), 800, "digest"))
     assert imported().command[-3:-1] == ["--max-size", "800"]
     assert imported(cameras="one").kind == "sfm"
+
+
+def test_poses_before_a_killed_run_are_imported(submitted, computed, shown, tmp_path):
+    (computed / "sparse" / "0" / "images.bin").write_bytes(b"whole")
+    keep_former(computed)
+    (computed / "sparse" / "0" / "images.bin").write_bytes(b"half-made")
+    write_source(computed, PhotosSource([tmp_path / "trip"], cameras="one"))
+    bpy.ops.objectgs.import_photos("EXEC_DEFAULT", directory=str(tmp_path / "trip"))
+    assert submitted[0].kind == "import" and shown[0]["text"].endswith("are imported as they are.")
+    assert (computed / "sparse" / "0" / "images.bin").read_bytes() == b"whole"
 
 
 def test_only_changes_of_photos_count(submitted, computed, tmp_path):

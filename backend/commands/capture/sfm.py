@@ -43,6 +43,7 @@ from ...shared.formats.photos_source import (
     read_source,
     write_source,
 )
+from ...shared.photos.former_model import undo_killed_run
 from ...shared.photos.source_files import digest_of_files
 from ...shared.reconstruction.folder import IGNORED
 from ...shared.reconstruction.lock import locked
@@ -71,6 +72,7 @@ def sfm(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     listed, unwanted = ([], []) if options.list is None else _read_list(options.list)
     sources, leave_out = [*options.photos, *listed], [*options.leave_out, *unwanted]
     capture = options.out.absolute()  # COLMAP's processes run in another folder.
+    undo_killed_run(capture)
     before = read_source(capture)
     if before is not None and before.photos == [path.resolve() for path in sources] and are_copied(sources, capture):
         reporter.warning(f"{_missing(sources)} does not exist any more, so its copies in {capture / IMAGES} are used.")
