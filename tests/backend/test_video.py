@@ -400,6 +400,37 @@ def test_masks_that_changed_after_a_damaged_one_are_copied_again(tmp_path):
     assert read_mask(capture / "masks" / "a.png").max() == 2
 
 
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_masks_that_changed_after_a_kill_are_copied_again(tmp_path, monkeypatch, error, suffix):
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    (folder / "masks").mkdir(parents=True)
+
+    def draw(color):
+        for name in "ab":
+            Image.new("RGB", (160, 120), (color,) * 3).save(folder / "masks" / f"{name}.{suffix}")
+
+    def killed(self, *_):
+        raise error
+
+    for name in ("a.jpg", "b.jpg"):
+        heic(folder / name)
+    draw(0)
+    with monkeypatch.context() as patched:
+        patched.setattr(photos, "warn_of_gone", killed)
+        with pytest.raises(error):
+            photos.take_photos([folder], capture, None, reporter())
+    draw(255)
+    photos.take_photos([folder], capture, None, reporter())
+    found = [read_mask(path).max() for path in (capture / "masks").iterdir()]
+    assert len(found) == 2 and min(found) > 0
+    (made,) = (path for path in (capture / "masks").iterdir() if path.name.startswith("a"))
+    Image.new("L", (160, 120), 7).save(made)
+    photos.take_photos([folder], capture, None, reporter())
+    assert read_mask(made).max() == 7, "corrected in the capture"
+    assert None not in json.loads((capture / "sfm" / "photos.json").read_text()).values()
+
+
 def test_copies_are_used_when_the_photos_are_gone(tmp_path):
     folder, capture = tmp_path / "trip", tmp_path / "capture"
     (folder / "day").mkdir(parents=True)

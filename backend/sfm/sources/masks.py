@@ -27,6 +27,7 @@ def write_masks(
     masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: Stamps
 ) -> None:
     """Write the masks of photos to the masks/ of a capture; names: of the photos there."""
+    stamps.expect(capture / MASKS / (names[photo] + suffix) for photo in photos for suffix in (".png", ".npz"))
     for photo in photos:
         suffix, data = encode_mask(ids_of(masks.read(photo)))
         target = capture / MASKS / (names[photo] + suffix)
@@ -53,10 +54,14 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
         and names[photo] != photo
     }
     others = [path for path in source.iterdir() if path.is_file() and LISTS.fullmatch(path.name)]
-    for path in [*others, *(path for path in (folder.rglob("*") if folder.is_dir() else ()) if path.is_file())]:
-        if path.suffix.lower() in LOSSY_SUFFIXES or legible(str(path)) != str(path):
-            continue
-        target = capture / renamed.get(path, path.relative_to(source))
+    paths = [*others, *(path for path in (folder.rglob("*") if folder.is_dir() else ()) if path.is_file())]
+    targets = {
+        path: capture / renamed.get(path, path.relative_to(source))
+        for path in paths
+        if path.suffix.lower() not in LOSSY_SUFFIXES and legible(str(path)) == str(path)
+    }
+    stamps.expect(targets.values())
+    for path, target in targets.items():
         if _is_missing(target, path, capture, stamps):
             make_folder(target.parent)
             with atomic_path(target) as part:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -20,7 +21,7 @@ class Stamps:
 
     def __init__(self, capture: Path) -> None:
         self._path = capture / WORK / FILES
-        self._known: dict[str, list[Any]] = read_json(self._path) if self._path.exists() else {}
+        self._known: dict[str, list[Any] | None] = read_json(self._path) if self._path.exists() else {}
         self._now: dict[str, list[Any]] = {}
 
     def has_changed(self, name: str, path: Path, *details: Any) -> bool:
@@ -42,7 +43,16 @@ class Stamps:
         """Return whether the original of a path in the capture was asked for now."""
         return f"../{name}" in self._now
 
+    def expect(self, copies: Iterable[Path]) -> None:
+        """Write the file, so that after a kill before `write`, the copies that do not exist yet count as changed."""
+        capture = self._path.parent.parent
+        missing = ((Path("..") / copy.relative_to(capture)).as_posix() for copy in copies if not copy.exists())
+        self._write({**self._known, **self._now, **dict.fromkeys(missing)})
+
     def write(self) -> None:
         """Write the file, with what was asked for now or earlier."""
+        self._write({name: stamp for name, stamp in {**self._known, **self._now}.items() if stamp is not None})
+
+    def _write(self, stamps: Mapping[str, list[Any] | None]) -> None:
         make_folder(self._path.parent)
-        write_json(self._path, {**self._known, **self._now})
+        write_json(self._path, stamps)
