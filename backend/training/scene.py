@@ -81,7 +81,6 @@ class Scene:
         self._device = device
         self._budget = memory_mb * 1e6
         if device.type == "cuda":
-            devices.limit_memory(device)
             self._budget = min(self._budget, _GPU_FRACTION * torch.cuda.mem_get_info(device)[0])
         self._held: OrderedDict[_Key, _Stored] = OrderedDict()
         self._bytes = 0

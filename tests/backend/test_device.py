@@ -31,7 +31,6 @@ from backend.training import step
 from backend.training.budget import Budget
 from backend.training.losses.on_cpu import image_loss, normal_loss, volume_loss
 from backend.training.optimizer.adam import step_rows, take_rows
-from backend.training.scene import Scene
 from backend.training.settings import Settings
 from backend.training.step import strips
 from backend.training.trainer import Trainer
@@ -554,7 +553,7 @@ def test_the_memory_of_windows_is_not_taken_for_the_gpus(monkeypatch, platform, 
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda most, _: found.append(most))
     devices.limit_memory.cache_clear()
     for _ in range(2):
-        Scene(None, None, None, device=gpu, gains=np.ones((1, 3)))
+        devices.limit_memory(gpu)
     devices.limit_memory.cache_clear()
     assert found == pytest.approx(limits)
 

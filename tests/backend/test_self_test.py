@@ -88,7 +88,8 @@ def with_gpu(tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "pick", lambda requested: devices.CPU if requested == "cpu" else GPU)
     monkeypatch.setattr(devices, "name_of", lambda device: "cuda (Card)" if device == GPU else "cpu")
     monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
-    runs = tmp_path / "runs.txt"
+    runs, limited = tmp_path / "runs.txt", []
+    monkeypatch.setattr(devices, "limit_memory", limited.append)
 
     def use(code):
         counted = f"open({str(runs)!r}, 'a').write('x')\n{code}"
@@ -98,6 +99,7 @@ def with_gpu(tmp_path, monkeypatch):
             messages = Messages()
             return chosen.choose_device(requested, messages, **options), messages.found
 
+        choose.limited = limited
         choose.runs = lambda: len(runs.read_text()) if runs.exists() else 0
         return choose
 
@@ -109,8 +111,8 @@ PASSES = "print('a line of a library')\nprint('{\"problem\": \"\"}')"
 
 def test_a_gpu_is_tested_once(with_gpu, monkeypatch):
     choose = with_gpu(PASSES)
-    assert choose("cpu") == (devices.CPU, []) and choose.runs() == 0
-    assert choose() == (GPU, ["Testing cuda (Card), once"])
+    assert choose("cpu") == (devices.CPU, []) and choose.runs() == 0 and not choose.limited
+    assert choose() == (GPU, ["Testing cuda (Card), once"]) and choose.limited == [GPU]
     assert choose() == choose("cuda") == (GPU, []) and choose.runs() == 1
     assert choose(again=True)[0] == GPU and choose.runs() == 2
     monkeypatch.setattr(chosen, "_driver", lambda: "a newer one")

@@ -53,7 +53,7 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
         again: Whether to repeat the test.
 
     Returns:
-        The torch device.
+        The torch device; of a GPU, torch then says when its memory is full.
 
     Raises:
         InputError: `requested` is "cuda", and CUDA is not available or fails the test.
@@ -72,6 +72,7 @@ def choose_device(requested: str, reporter: Reporter, again: bool = False) -> to
             with contextlib.suppress(OSError):
                 write_json(_outcome(device), {"problem": problem})
     if not problem:
+        devices.limit_memory(device)
         return device
     failure = f"{devices.name_of(device)} fails a test ({problem})"
     if requested == "cuda":
