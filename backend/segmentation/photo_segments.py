@@ -22,6 +22,9 @@ from ..shared.formats.json_file import parse_json
 _VERSION = 3
 """Number to be raised with changes of what is found or kept, so that earlier results are not used any more."""
 
+_PARTS = (".json", ".safetensors", ".bin", ".txt", ".pt", ".pth", ".yaml", ".yml")
+"""Suffixes of the files of a checkpoint; the original model may be beside that of the package transformers."""
+
 _TURN = Image.Transpose
 _TURNS = {
     2: (_TURN.FLIP_LEFT_RIGHT, _TURN.FLIP_LEFT_RIGHT), 3: (_TURN.ROTATE_180, _TURN.ROTATE_180),
@@ -67,7 +70,7 @@ class Finder(NamedTuple):
 
 def chosen_checkpoint(path: Path) -> Path:
     """Return the folder of a checkpoint if one of its files was chosen in place of it, or else the path."""
-    is_part = path.is_file() and path.suffix in (".json", ".safetensors", ".bin", ".txt")
+    is_part = path.is_file() and path.suffix.lower() in _PARTS
     return path.parent if is_part and is_checkpoint(path.parent) else path
 
 

@@ -510,7 +510,10 @@ def test_masks_of_other_photos_and_of_no_known_kind_are_refused(photos, tmp_path
     (tmp_path / "meta").mkdir()
     model = tmp_path / "meta" / "sam_vit_h_4b8939.pth"
     model.touch()
-    for path in (model, model.parent):
+    (tmp_path / "with config").mkdir()
+    for name, content in (("model.pth", ""), ("config.json", "{}")):
+        (tmp_path / "with config" / name).write_text(content)
+    for path in (model, model.parent, tmp_path / "with config"):
         assert_rejected(run_command("masks", photos, path), str(path), "which cannot be read; download all files of")
 
 

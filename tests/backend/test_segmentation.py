@@ -381,7 +381,7 @@ def scene(write_capture):
     return write_capture(views=6, masks=False)
 
 
-@pytest.mark.parametrize("name", ["preprocessor_config.json", "tokenizer.json", "model.safetensors", "vocab.txt"])
+@pytest.mark.parametrize("name", ["tokenizer.json", "model.safetensors", "vocab.txt", "sam2.1_hiera_tiny.pt"])
 def test_files_of_a_checkpoint_stand_for_its_folder(scene, shades, tmp_path, run_command, name):
     model = write_checkpoint(tmp_path / "model")
     (model / name).touch()

@@ -97,7 +97,7 @@ def _of_folder(path: Path, photos: Photos, names: Sequence[str]) -> list[MaskSou
         ExrMasks(exr), MaskFiles(path, names, photos.folder), MaskFolders(path, photos), coco.PhotoJson(path, photos)
     ]  # fmt: skip
     described = [path / name for name in files.paths if re.fullmatch(r"[^/]+\.(json|xml)", name, re.IGNORECASE)]
-    if len(described) == 1 and described[0].stem not in ("labels", "masks"):
+    if len(described) == 1 and described[0].stem not in ("labels", "masks", "config"):
         try:
             found.append(_of_file(described[0], photos))
         except InputError:
