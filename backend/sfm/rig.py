@@ -25,7 +25,7 @@ def tie_rigs(model: pycolmap.Reconstruction, left_out: Sequence[pycolmap.Image] 
 
     Args:
         model: the poses; changed in place.
-        left_out: photos that mappers have left out; those of a rig are added if another one of their moment has a pose.
+        left_out: photos that match nothing; those of a rig are added if another one of their moment has a pose.
 
     Returns:
         The folders of each rig, with slashes at the end.

@@ -33,7 +33,7 @@ import numpy as np
 import pycolmap
 
 from ..shared.stopping import take_stdin
-from .database import camera_of, listed_names, read_pairs, restore_names
+from .database import camera_of, listed_names, read_pairs, restore_names, verified_pairs
 from .rig import tie_rigs
 
 SEED = 0
@@ -244,13 +244,17 @@ def refine(model: str, out: str, database: str, names: str, calibrated: str = ""
 
 
 def left_out(model: pycolmap.Reconstruction, database: str, names: list[str]) -> list[pycolmap.Image]:
-    """Return the named photos of a database that are not in a model, since mappers leave out what matches nothing."""
+    """Return the named photos of a database that match nothing, which mappers leave out of their models.
+
+    Others that are not in a model have matches that contradict every pose, or are too few to tell.
+    """
+    matched = {number for pair in verified_pairs(Path(database), names) for number in pair[:2]}
     wanted = set(names) - {image.name for image in model.images.values()}
     with pycolmap.Database.open(database) as opened:
         return [
             pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
             for image in opened.read_all_images()
-            if image.name in wanted
+            if image.name in wanted and image.image_id not in matched
         ]
 
 

@@ -1,6 +1,9 @@
 """Cameras that are known before poses are computed: their lenses, and which are fixed to each other."""
 
 import json
+import shutil
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pycolmap
@@ -118,14 +121,18 @@ def test_photo_without_pose_gets_that_of_its_rig(pairs):
     assert np.abs(found.cam_from_world().matrix() - before).max() < 0.05
 
 
-def test_photo_that_matches_nothing_gets_the_pose_of_its_rig(pairs):
+def test_photo_that_matches_nothing_gets_the_pose_of_its_rig(pairs, tmp_path):
     model = pycolmap.Reconstruction(pairs / "sfm" / "chosen")
     (lost,) = (image for image in model.images.values() if image.name == "right/3.png")
     before = lost.cam_from_world().matrix()
     lost.name = "other/3.png"
     names = [*(image.name for image in model.images.values()), "right/3.png"]
-    assert not worker.left_out(model, str(pairs / "sfm" / "database.db"), names[:-1]), "it is not used"
-    (photo,) = worker.left_out(model, str(pairs / "sfm" / "database.db"), names)
+    path = shutil.copyfile(pairs / "sfm" / "database.db", tmp_path / "database.db")
+    assert not worker.left_out(model, str(path), names), "its matches contradict the pose that it had"
+    with closing(sqlite3.connect(path)) as opened, opened:
+        opened.execute("DELETE FROM two_view_geometries")
+    assert not worker.left_out(model, str(path), names[:-1]), "it is not used"
+    (photo,) = worker.left_out(model, str(path), names)
     assert (photo.name, photo.camera_id) == ("right/3.png", lost.camera_id)
     photo.image_id = 100
     alone = pycolmap.Image(name="right/9.png", camera_id=lost.camera_id, image_id=101)
