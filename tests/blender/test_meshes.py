@@ -696,6 +696,15 @@ def test_mesh_in_edit_mode_is_not_exported(root, tmp_path):
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
+@pytest.mark.parametrize("mode", ["SCULPT", "VERTEX_PAINT", "WEIGHT_PAINT", "TEXTURE_PAINT"])
+def test_mesh_in_a_mode_that_keeps_its_vertices_is_exported(root, tmp_path, mode):
+    bpy.context.view_layer.objects.active = mesh_of(root, 1)
+    bpy.ops.object.mode_set(mode=mode)
+    (path,) = mesh_export.export(root, tmp_path / "mug.obj", "obj", [1], False, False)
+    assert "\nf " in path.read_text()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
 # Operators and panels.
 
 

@@ -90,7 +90,7 @@ def export(
     if per_object:
         stems = distinct_stems({key: name for key, (name, _) in named_parts.items()})
         parts_of = {out / f"{stem}.{suffix}": named_parts[key][1] for key, stem in stems.items()}
-    scene.require_object_mode(mesh for parts in parts_of.values() for _, mesh in parts)
+    scene.require_object_mode(mesh for parts in parts_of.values() for _, mesh in parts if mesh.data.is_editmode)
     for path in parts_of:
         Reconstruction(scene.folder_of(root)).require_foreign(path)
     if in_capture:
