@@ -75,9 +75,9 @@ def absolute(chosen: str) -> Path:
     """
     folder = Path(bpy.path.abspath(chosen))
     if not folder.is_absolute():
-        raise InputError(
-            f"The folder {chosen} is relative, or without a drive; save the .blend first, or choose another"
-        )
+        if chosen.startswith("//"):
+            raise InputError(f"The folder {chosen} is relative to the .blend; save the .blend first, or choose another")
+        raise InputError(f"The folder {chosen} is relative, or without a drive; choose another")
     return folder
 
 

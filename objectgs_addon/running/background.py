@@ -331,8 +331,14 @@ def _import_made(job: Job, owner: bpy.types.Scene | None) -> bool:
         first = "set up the backend, then use" if locations.backend_python() is None else "use"
         messages.show(f"The new capture is in {job.folder}; {first} Import Capture, and open this folder")
         return False
-    demo = locations.reconstructions_folder() / "demo" if job.kind == "demo" else None
-    submit(import_job(job.folder, demo), owner, lambda _kind, text: messages.show(text, "ERROR"))
+    try:
+        demo = locations.reconstructions_folder() / "demo" if job.kind == "demo" else None
+        following = import_job(job.folder, demo)
+    except InputError as error:
+        raise InputError(
+            f"The new capture is in {job.folder}; use Import Capture, since this failed: {error}"
+        ) from error
+    submit(following, owner, lambda _kind, text: messages.show(text, "ERROR"))
     return False
 
 

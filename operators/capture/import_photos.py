@@ -114,6 +114,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
                 **again,
             )
             return {"CANCELLED"}
+        locations.reconstructions_folder()  # The import that follows after maybe hours must not fail by it.
         return background.submit(locations.sfm_job(capture, wanted), context.scene, self.report)
 
     def _sources(self) -> list[Path]:

@@ -5,6 +5,7 @@ import bpy
 
 from ...objectgs_addon.environment import locations
 from ...objectgs_addon.running import background
+from ..common.reporting import reports_errors
 
 
 class MakeDemo(bpy.types.Operator):
@@ -20,7 +21,9 @@ class MakeDemo(bpy.types.Operator):
             return False
         return True
 
+    @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
+        locations.reconstructions_folder()  # The import that follows must not fail by it.
         return background.submit(locations.demo_job(), context.scene, self.report)
 
 

@@ -12,6 +12,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 import objectgs as extension
+from objectgs.backend.shared.errors import InputError
 from objectgs.backend.shared.formats.photos_source import PhotosSource, write_source
 from objectgs.backend.shared.photos.former_model import keep_former
 from objectgs.backend.shared.photos.source_files import digest_of_files, has_poses_of
@@ -85,18 +86,42 @@ def test_folders_relative_to_an_unsaved_file_are_refused(fresh, registered, tmp_
     monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
     monkeypatch.setattr(locations, "preferences", lambda: preferences)
     (tmp_path / "trip").mkdir()
+    refusal = r"The folder //recs/? is relative to the \.blend; save the \.blend first"
     for operator in (bpy.ops.objectgs.import_capture, bpy.ops.objectgs.import_photos):
         for chosen in ("", "//recs"):
-            with pytest.raises(RuntimeError, match=r"The folder //recs/? is relative, .* save the \.blend first"):
+            with pytest.raises(RuntimeError, match=refusal):
                 operator("EXEC_DEFAULT", directory=str(tmp_path / "trip"), folder=chosen)
+    # An absolute folder for the capture leaves that of the import that follows.
+    with pytest.raises(RuntimeError, match=refusal):
+        bpy.ops.objectgs.import_photos(directory=str(tmp_path / "trip"), folder=str(tmp_path / "capture"))
+    with pytest.raises(RuntimeError, match=refusal):
+        bpy.ops.objectgs.make_demo()
+    assert not jobs
     assert results.trained_on(tmp_path / "trip") == []
     opened = SimpleNamespace(directory="")
     context = SimpleNamespace(window_manager=SimpleNamespace(fileselect_add=lambda _: None))
     assert OpenReconstruction.invoke(opened, context, None) == {"RUNNING_MODAL"} and opened.directory == ""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "saved.blend"))
+    with pytest.raises(RuntimeError, match="The folder recs/trip is relative, or without a drive; choose another"):
+        bpy.ops.objectgs.import_capture(directory=str(tmp_path / "trip"), folder="recs/trip")
     for chosen, folder in (("", tmp_path / "recs" / "trip"), ("//mine", tmp_path / "mine")):
         bpy.ops.objectgs.import_capture(directory=str(tmp_path / "trip"), folder=chosen)
         assert jobs.pop().folder == folder and not jobs
+
+
+@pytest.mark.parametrize(
+    "make", [locations.demo_job, lambda: locations.sfm_job(Path("/trip"), PhotosSource([Path("/trip")]))]
+)
+def test_a_capture_that_cannot_be_imported_is_named(fresh, registered, monkeypatch, make):
+    """The folder in the preferences, or the .blend, can change while the capture is made."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    job = make()
+    monkeypatch.setattr(locations, "reconstructions_folder", lambda: locations.absolute("//recs/"))
+    background._submitted_in[job] = bpy.context.scene.session_uid
+    with pytest.raises(InputError) as caught:
+        background.finish(job)
+    start = f"The new capture is in {job.folder}; use Import Capture, since this failed: The folder //recs/ is relative"
+    assert str(caught.value).startswith(start)
 
 
 def test_same_sources_continue_in_their_capture(submitted, tmp_path):
