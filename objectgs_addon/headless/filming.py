@@ -77,9 +77,11 @@ def film(options: argparse.Namespace) -> None:
         *(["--png"] if options.png else []),
     )
     if options.composite or options.save:
-        filming.set_up_compositor(target, target.view_layers[0], root, out)
+        # The reconstruction may have a layer of its own, beside that of other objects.
+        rendered = next((each for each in target.view_layers if each.use), layer)
+        filming.set_up_compositor(target, rendered, root, out)
         for problem in (
-            filming.rendered_twice(target, target.view_layers[0], root),
+            filming.rendered_twice(target, rendered, root),
             scene.render_problem(target, root),
         ):
             if problem is not None:

@@ -826,6 +826,21 @@ def test_film_command_takes_a_view_layer_with_the_reconstruction(shot_blend, not
     assert places == [{}, {}] and "Nothing of wall is shown in renders of the view layer ViewLayer" in "".join(output)
 
 
+def test_film_command_composes_with_a_view_layer_that_is_rendered(shot_blend, noting_backend, tmp_path, monkeypatch):
+    """Also if another one of them has the reconstruction."""
+    bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
+    layers, used = bpy.context.scene.view_layers, []
+    layers[0].use = False
+    layers.new("objects").layer_collection.children["wall"].exclude = True
+    layers.new("splats")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "layers.blend"))
+    for name in ("set_up_compositor", "rendered_twice"):
+        monkeypatch.setattr(filming.filming, name, lambda _scene, layer, *_: used.append(layer.name))
+    command = ["film", str(tmp_path / "layers.blend"), "--out", str(tmp_path / "out"), "--frames", "1"]
+    assert headless.main([*command, "--save", str(tmp_path / "joined.blend")]) == 0
+    assert used == ["objects", "objects"]
+
+
 def test_film_command_renders_only_missing_composites(shot_blend, noting_backend, tmp_path, monkeypatch, capsys):
     blend, out, written = shutil.copy(shot_blend, tmp_path), tmp_path / "out", []
 
