@@ -15,6 +15,7 @@ from ...backend.shared.errors import InputError
 from ...backend.shared.events import Reporter
 from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.objects import read_objects
 from ...backend.shared.reconstruction.shot import NAME, frame_ranges, write_shot
 from .. import film as filming
 from .. import scene
@@ -56,7 +57,11 @@ def film(options: argparse.Namespace) -> None:
     layer = filming.layer_of(target, root)
     shot = filming.shot_of(target, layer, root, frames, options.subframes or samples_of(target), camera=camera)
     target.camera = camera or target.camera
-    for problem in (filming.ignored_settings(target, camera), filming.empty_frames(shot, layer, root)):
+    for problem in (
+        filming.ignored_settings(target, camera),
+        filming.empty_frames(shot, layer, root),
+        _newer_places(root, Reconstruction(folder).objects),
+    ):
         if problem is not None:
             reporter.warning(problem)
     out.mkdir(parents=True, exist_ok=True)
@@ -103,6 +108,13 @@ def film(options: argparse.Namespace) -> None:
             path = _composite(out, number, options.composite)
             write_picture(target, path)
             reporter.status(f"Wrote {path}.")
+
+
+def _newer_places(root: bpy.types.Collection, objects: Path) -> str | None:
+    """Return a sentence if objects.json has other placements or duplicates than a reconstruction; None if not."""
+    if not objects.exists() or scene.shows_places(root, read_objects(objects)):
+        return None
+    return f"{root.name} does not show the edits in {objects}, which films use; use Reload Result in Blender."
 
 
 def _choices(options: argparse.Namespace) -> dict[str, Any]:

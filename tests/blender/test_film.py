@@ -826,6 +826,23 @@ def test_film_command_takes_a_view_layer_with_the_reconstruction(shot_blend, not
     assert places == [{}, {}] and "Nothing of wall is shown in renders of the view layer ViewLayer" in "".join(output)
 
 
+def test_film_command_tells_of_places_that_the_file_lacks(shot_blend, noting_backend, tmp_path, capsys):
+    objects, command = shot_blend.parent / "wall" / "objects.json", ["film", str(shot_blend), "--out", str(tmp_path)]
+
+    def told():
+        assert headless.main([*command, "--frames", "1"]) == 0
+        return f"wall does not show the edits in {objects}, which films use" in "".join(capsys.readouterr())
+
+    assert not told()
+    moved = np.eye(4)
+    moved[0, 3] = 5.0
+    edit_objects(objects, {1: {"transform": moved.tolist()}})
+    try:
+        assert told()
+    finally:
+        edit_objects(objects, {1: {"transform": None}})
+
+
 def test_film_command_composes_with_a_view_layer_that_is_rendered(shot_blend, noting_backend, tmp_path, monkeypatch):
     """Also if another one of them has the reconstruction."""
     bpy.ops.wm.open_mainfile(filepath=str(shot_blend))
