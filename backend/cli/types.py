@@ -8,7 +8,10 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ..shared.color.recolor import Recolor
+from ..shared.reconstruction.objects import is_singular
 
 
 def integer(text: str, least: int, expected: str) -> int:
@@ -89,7 +92,12 @@ def matrix(text: str) -> list[list[float]]:
     if len(words) != 16:
         raise argparse.ArgumentTypeError(f"{text} are not 16 numbers with commas between them")
     values = [number("MATRIX", word) for word in words]
-    return [values[row : row + 4] for row in (0, 4, 8, 12)]
+    rows = [values[row : row + 4] for row in (0, 4, 8, 12)]
+    if not np.allclose(rows[3], (0, 0, 0, 1), rtol=0, atol=1e-4):
+        raise argparse.ArgumentTypeError(f"{text} does not end in 0,0,0,1; write the matrix row by row")
+    if is_singular(np.array(rows)):
+        raise argparse.ArgumentTypeError(f"{text} flattens everything; give it a scale other than zero")
+    return rows
 
 
 def recolor(text: str) -> tuple[str, Recolor]:

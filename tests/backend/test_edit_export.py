@@ -310,8 +310,11 @@ def test_blender_coordinates_follow_the_empty(run_command, folder, tmp_path):
     expected = (captured.means - (1, 2, 3)) @ world[:3, :3].T + world[:3, 3]
     np.testing.assert_allclose(found.means, expected, atol=1e-5)
     np.testing.assert_allclose(np.sort(found.scales), np.sort(2.5 * captured.scales), rtol=1e-5)
-    for wrong in ("1,2", numbers + ",0", numbers.replace("4.0", "nan")):
+    columns, flat = (",".join(map(repr, each.ravel().tolist())) for each in (world.T, np.diag([0.0, 0, 0, 1])))
+    for wrong in ("1,2", numbers + ",0", numbers.replace("4.0", "nan"), columns, flat):
         assert run_command("export", folder.folder, *options, f"--to-world={wrong}").code == 2
+    result = run_command("export", folder.folder, *options[:2], f"--to-world={numbers}")
+    assert result.code == 2 and "--to-world is for --coordinates blender" in result.err
 
 
 def test_export_of_fit_warns_with_psnr(run_command, folder, tmp_path):

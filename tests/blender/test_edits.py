@@ -1351,6 +1351,14 @@ def test_splats_are_exported_where_blender_shows_them(root, folder, backend_pyth
         np.testing.assert_allclose(exported[table["object_id"] == object_id], shown, atol=1e-4)
 
 
+def test_splats_that_blender_shows_as_a_point_are_not_exported(root, monkeypatch, tmp_path):
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    kinds.parent_of(root).scale = (0.0, 0.0, 0.0)
+    bpy.context.view_layer.update()
+    with pytest.raises(RuntimeError, match="is scaled to zero by its parent; set a scale other than zero"):
+        bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), coordinates="blender")
+
+
 @pytest.mark.long
 def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_python, tmp_path):
     activate(root, 1)

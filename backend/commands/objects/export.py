@@ -35,6 +35,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     background = record.export.background if record.export else None
     if options.bake_background and not background:
         raise InputError(f"{folder.settings} names no background to bake; train on, or leave out --bake-background.")
+    if options.to_world is not None and options.coordinates != "blender":
+        raise InputError("--to-world is for --coordinates blender; add this, or leave out --to-world.")
     kind = _format(options)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]

@@ -7,6 +7,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ....backend.shared.errors import InputError
+from ....backend.shared.reconstruction.objects import is_singular
 from .. import carrier
 from ..capture import origin_of
 from ..kinds import ANCHORS, MESH, OBJECT_PARENT, SPLATS, kind_of, parent_of, part_of, parts_of, require_parent
@@ -131,9 +133,12 @@ def matrix_of_root(root: bpy.types.Collection) -> np.ndarray:
     """Return the map from capture coordinates relative to the origin to the world, (4, 4) float64.
 
     Raises:
-        InputError: The parent empty is missing.
+        InputError: The parent empty is missing, or scaled to zero.
     """
-    return matrix_to_world(require_parent(root))
+    world = matrix_to_world(require_parent(root))
+    if is_singular(world):
+        raise InputError(f"{root.name} is scaled to zero by its parent; set a scale other than zero.")
+    return world
 
 
 def distance_moved(root: bpy.types.Collection, collection: bpy.types.Collection) -> float:
