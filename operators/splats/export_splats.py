@@ -33,7 +33,12 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
         name="Coordinates",
         items=[
             ("capture", "Capture", "Coordinates of the captured cameras"),
-            ("blender", "Blender", "Positions in Blender, with Set Ground and Set Distance, as Export Meshes writes"),
+            (
+                "blender",
+                "Blender",
+                "Positions in Blender, with Set Ground and Set Distance. PLY and Splat are Z up, as USD meshes; SPZ is "
+                "Y up, as glTF and OBJ meshes",
+            ),
         ],
     )
 
