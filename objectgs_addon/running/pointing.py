@@ -88,6 +88,9 @@ class _Session:
             content = {"request": self.asked, "propose": True, "detail": detail}
             self.process.send(json.dumps(content), replaces=True)
 
+    def will_propose(self) -> bool:
+        return self.is_proposing or self.wanted_detail is not None
+
     def take(self, event: dict[str, Any]) -> int | None:
         """Process an event; return the number of a stroke that shows no splats."""
         try:
@@ -181,8 +184,10 @@ _keeps_colors = False
 """Whether the splats keep the colors of the marks while a job separates the objects."""
 
 
-def start(root: bpy.types.Collection) -> None:
+def start(root: bpy.types.Collection, proposes: bool = False) -> None:
     """Start the process for a reconstruction, unless it runs with the segmentation model of the preferences.
+
+    proposes: a suggestion is asked for next, so that it is not told that an earlier one ends.
 
     Raises:
         InputError: the folder has no splats that can be read, or the process cannot be started.
@@ -190,11 +195,14 @@ def start(root: bpy.types.Collection) -> None:
     global _session
     if is_active(root) and segmenter(root) == locations.segmenter():
         return
+    is_canceled = not proposes and is_active(root) and _session is not None and _session.will_propose()
     stop()
     try:
         _session = _Session(root)
     except OSError as error:
         raise InputError(f"The backend could not be started ({error.strerror or error}).") from error
+    if is_canceled:
+        _session.say("The segmentation model has changed, so Suggest Objects was canceled; press it again")
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
 
@@ -231,7 +239,7 @@ def _end() -> bool:
 
 def propose(root: bpy.types.Collection) -> None:
     """Ask for objects without strokes, which replace those that are marked; starts the process if it does not run."""
-    start(root)
+    start(root, proposes=True)
     assert _session is not None
     _session.proposed_to_replace = marks.content(root)
     _session.propose(root.objectgs.detail)
@@ -286,7 +294,7 @@ def refresh(root: bpy.types.Collection) -> None:
     """Ask for the objects of strokes if they have changed, which may settle a problem of earlier ones."""
     if _session is not None and _session.root == root.session_uid:
         content = marks.content(root)
-        is_proposing = _session.is_proposing or _session.wanted_detail is not None
+        is_proposing = _session.will_propose()
         if is_proposing and content == _session.proposed_to_replace:
             # What was undone or set was something else.
             return

@@ -447,6 +447,20 @@ def test_a_model_chosen_while_marking_is_used_from_the_next_stroke_on(root, sess
     assert pointing._session is again
 
 
+@pytest.mark.parametrize("is_ready", [False, True])
+def test_a_model_chosen_while_objects_are_suggested_tells_of_the_end(root, session, monkeypatch, tmp_path, is_ready):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, *_: told.append(text))
+    session.ready = is_ready
+    for number, repeat in enumerate((pointing.propose, pointing.start)):
+        pointing.propose(root)
+        own = SimpleNamespace(segmenter=str(tmp_path / f"model {number}"), backend_python="", reconstructions="")
+        monkeypatch.setattr(locations, "preferences", lambda own=own: own)
+        repeat(root)
+        assert len(told) == number
+    assert "model has changed, so Suggest Objects was canceled" in told[0] == pointing._session.said
+
+
 PROPOSED = {
     "everything": True,
     "strokes": [
