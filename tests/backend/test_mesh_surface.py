@@ -638,9 +638,11 @@ def test_memory_scales_with_surface_and_respects_limit():
     warnings = []
     reporter = Reporter()
     reporter.warning = warnings.append
-    small = fuse(views, [0], memory_mb=5, reporter=reporter)
+    fuse(views, [0], resolution=32, memory_mb=(coarse - 1) * SAMPLES * 32 / 1e6, reporter=reporter)
+    assert not warnings, "10 % coarser is not visible"
+    small = fuse(views, [0], memory_mb=5, reporter=reporter, name="ball")
     assert len(small.blocks) * SAMPLES * 16 < 5e6
-    assert len(warnings) == 1 and "memory" in warnings[0]
+    assert warnings == ["The mesh of ball is coarser than the photos allow, to save memory."]
     surface = extract(small)
     assert_valid_surface(surface)
     assert errors(surface, ball()).mean() < 0.3 * small.voxel

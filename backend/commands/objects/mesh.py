@@ -162,7 +162,7 @@ def _make(target: Target, options: argparse.Namespace, trained: Trained, views: 
             raise NoSurface(
                 f"{target.name} has no splats, so it has no mesh; was it left out of training or separated?"
             )
-        field = fuse(views, classes.tolist(), reporter=part.step("fuse"))
+        field = fuse(views, classes.tolist(), reporter=part.step("fuse"), name=target.name)
         surface = extract(field, closed=not options.open, faces=budget, reporter=part.step("extract"))
     except NoSurface as reason:
         for suffix in (".ply", ".png"):

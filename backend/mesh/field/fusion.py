@@ -39,6 +39,8 @@ _MOST_POINTS, _THINNING = 8_000_000, 3
 """Number of observed points that are kept in memory, 32 bytes each, and by what they are divided where it is passed."""
 _COARSEST, _FEW = 16, 1000
 """Smallest number of voxels along the longest side, regardless of memory; additional blocks allowed in this case."""
+_HARDLY_COARSER = 0.8
+"""Fraction of the resolution that the photos allow from which on no warning is needed."""
 _FILLING = 8
 """Time to fill the holes of the surface, relative to the time of one view, for the progress bar."""
 _SURE = 1.0
@@ -100,6 +102,7 @@ def fuse(
     resolution: int = RESOLUTION,
     memory_mb: float = 1500,
     reporter: Reporter | None = None,
+    name: str = "the objects",
 ) -> Field:
     """Fuse the views of objects into one signed distance field.
 
@@ -109,8 +112,9 @@ def fuse(
         views: The renders of the model.
         classes: The class indices of the objects, which are treated as one object.
         resolution: The largest number of voxels along the longest side.
-        memory_mb: Memory limit. If it is too small, voxels are enlarged, with a warning.
+        memory_mb: Memory limit. If it is too small, voxels are enlarged, with a warning if it is by much.
         reporter: Receives the progress and the warning.
+        name: What the warning calls the objects.
 
     Returns:
         The field around the surface.
@@ -133,11 +137,8 @@ def fuse(
             if voxel > size / _COARSEST:
                 # Allow a few more blocks, whose memory is negligible.
                 voxel, max_blocks = max(requested_voxel, size / _COARSEST), error.blocks + _FEW
-    if voxel > requested_voxel:
-        reporter.warning(
-            f"The memory is enough for {size / voxel:.0f} voxels along the longest side, not for the "
-            f"{size / requested_voxel:.0f} that the photos allow; the mesh is coarser."
-        )
+    if voxel * _HARDLY_COARSER > requested_voxel:
+        reporter.warning(f"The mesh of {name} is coarser than the photos allow, to save memory.")
     return field
 
 
