@@ -166,10 +166,12 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     _draw_button(button, step)
     if jobs:
         _draw_jobs(column, jobs)
-    else:
-        purpose = column.column()
-        purpose.active = False
-        write(purpose, step.purpose)
+    # Other operators tell themselves why they have to wait; imports can be started elsewhere meanwhile.
+    is_import_waiting = must_wait and step == IMPORT
+    if is_import_waiting or not jobs:
+        text = column.column()
+        text.active = False
+        write(text, "To import something else, wait for this job or stop it." if is_import_waiting else step.purpose)
     if step.operator == "objectgs.set_up_backend":
         opens = column.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES")
         opens.module = locations.PACKAGE

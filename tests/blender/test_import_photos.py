@@ -20,9 +20,13 @@ from objectgs.backend.shared.reconstruction.folder import Reconstruction
 from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_record
 from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
+from objectgs.objectgs_addon.panels.capture import CapturePanel
+from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_photos
 from objectgs.operators.capture.open_reconstruction import OpenReconstruction
+
+from .drawn import texts_of
 
 
 @pytest.fixture
@@ -77,6 +81,15 @@ def test_calibration_must_exist_and_is_used_again(submitted, tmp_path):
     for job in submitted:
         assert job.command[job.command.index("--calibration") + 1] == str(lenses)
     assert len(submitted) == 2
+
+
+def test_panel_tells_why_the_import_has_to_wait(submitted, tmp_path, monkeypatch):
+    told = texts_of(CapturePanel)
+    assert "The first button" in told and "wait for this job" not in told
+    job = Job("Photos of trip", "sfm", tmp_path / "trip", ["true"], tmp_path)
+    monkeypatch.setattr(background.queue, "jobs", [job])
+    told = texts_of(CapturePanel)
+    assert "To import something else, wait for this job or stop it." in told and "The first button" not in told
 
 
 def test_folders_relative_to_an_unsaved_file_are_refused(fresh, registered, tmp_path, monkeypatch):
