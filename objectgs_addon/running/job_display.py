@@ -56,7 +56,7 @@ def draw_running(
         job: the job.
         index: its place in the queue.
         running: the job of the queue that runs, for which others wait.
-        brief: draw its title instead of what it does and warns of.
+        brief: draw its title and stage without its step and warnings.
     """
     row = layout.row(align=True)
     if job.state is State.WAITING:
@@ -71,7 +71,8 @@ def draw_running(
         row.operator("objectgs.resume_job", text="", icon="PLAY")
     row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
-        write(layout, job.title if brief else f"{job.title}: {activity(job)}")
+        doing = job.stage if brief else activity(job)
+        write(layout, f"{job.title}: {doing}" if doing else job.title)
     if not brief:
         _draw_warnings(layout, job.warnings[-_WARNINGS:])
 

@@ -14,6 +14,7 @@ import pytest
 from objectgs.backend.shared.events import Reporter
 from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.panels.jobs import JobsPanel
+from objectgs.objectgs_addon.panels.tab import draw_job
 from objectgs.objectgs_addon.process import jobs
 from objectgs.objectgs_addon.process.backend_process import BackendProcess, backend_command, backend_environment
 from objectgs.objectgs_addon.process.blocking import run_blocking
@@ -658,6 +659,19 @@ def test_panel_tells_warnings_of_a_running_job_and_what_others_wait_for(tmp_path
     told = texts_of(JobsPanel)
     assert "Two. A smaller Image Size is faster." in told and "One." not in told
     assert "Extract Meshes: waiting for Train (paused)" in told
+
+
+def test_first_panel_tells_the_stage_of_a_job_but_no_step(tmp_path):
+    train = Job("Train trip", "train", tmp_path, ["true"], tmp_path)
+    train.state, train.message = State.PAUSED, "Reading the photos"
+
+    class Brief:
+        def draw(self, _context):
+            draw_job(self.layout, train, 0, brief=True)
+
+    assert "Train trip" in texts_of(Brief) and "Train trip:" not in texts_of(Brief)
+    train.stage = "Preparing (1 of 3)"
+    assert "Train trip: Preparing (1 of 3)" in texts_of(Brief) and "Reading" not in texts_of(Brief)
 
 
 def test_ends_are_told_with_what_was_made(tmp_path, monkeypatch):
