@@ -60,6 +60,8 @@ _requested_fills: dict[Path, Path] = {}
 """Reconstruction folder -> file requested from its latest fill job."""
 _then: dict[Job, int] = {}
 """Job that installs packages -> number of the failed job that is run again after it; 0: none."""
+_poses_told: dict[Path | None, str] = {}
+"""Capture folder -> message about its poses, which goes when the capture has been trained."""
 _announced: set[Job] = set()
 """Jobs in `_results` whose delay was reported to the user."""
 
@@ -226,6 +228,8 @@ def _handle_end(job: Job) -> None:
         messages.show(f"{job.title}: {in_blender(job.error or job.message)}", "ERROR", operator, label, **options)
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
+        for root in results.roots_of(job.folder) if job.kind == "train" else ():
+            messages.withdraw(_poses_told.pop(folder_trust.state_of(root).capture, ""))
     elif job.state is State.STOPPED and job.kind == "sfm":
         messages.show(after_stop(job))
     # One that was stopped while it waited has changed nothing.
@@ -362,6 +366,7 @@ def _show_poses(job: Job) -> None:
         text += " The folder sfm of the capture names all of them."
     weak, sets, number = (job.result.get(key) for key in ("weak", "separate_sets", "set"))
     again = {"operator": "objectgs.recompute_poses", "capture": str(job.folder)}
+    _poses_told[job.folder] = text
     if isinstance(sets, list) and len(sets) > 1 and isinstance(number, int):
         following = number % len(sets) + 1
         messages.show(text, label=f"Use Set {following} ({sets[following - 1]} Photos)", photo_set=following, **again)

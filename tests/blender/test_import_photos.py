@@ -21,7 +21,7 @@ from objectgs.backend.shared.reconstruction.record import CaptureRecord, update_
 from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.panels.capture import CapturePanel
-from objectgs.objectgs_addon.process.jobs import Job
+from objectgs.objectgs_addon.process.jobs import Job, State
 from objectgs.objectgs_addon.running import background, results
 from objectgs.operators.capture import import_photos
 from objectgs.operators.capture.open_reconstruction import OpenReconstruction
@@ -292,6 +292,22 @@ def test_messages_about_earlier_poses_go_with_new_ones(submitted, computed, monk
     monkeypatch.setattr(messages, "_messages", list(told))
     bpy.ops.objectgs.recompute_poses("EXEC_DEFAULT", capture=str(computed))
     assert messages._messages == told[1:]
+
+
+def test_message_about_poses_goes_when_they_have_been_trained_on(submitted, computed, shown, tmp_path, monkeypatch):
+    poses = locations.sfm_job(computed, PhotosSource([tmp_path / "trip"]))
+    poses.result = {"weak": ["2.jpg"]}
+    background._show_poses(poses)
+    told = [messages.Message(shown[0]["text"], operator="objectgs.recompute_poses"), messages.Message("Other.")]
+    monkeypatch.setattr(messages, "_messages", list(told))
+    monkeypatch.setattr(results, "roots_of", lambda _folder: ["root"])
+    monkeypatch.setattr(background.folder_trust, "state_of", lambda _root: SimpleNamespace(capture=computed))
+    for kind, left in (("import", told), ("train", told[1:])):
+        job = Job("Job", kind, tmp_path / "trip", ["true"], tmp_path)
+        job.state = State.DONE
+        background._handle_end(job)
+        background._results.clear()
+        assert messages._messages == left
 
 
 def test_new_poses_for_a_training_are_asked_about(submitted, computed, shown, tmp_path, monkeypatch):
