@@ -395,8 +395,11 @@ def test_one_list_of_objects_is_open(root, session):
 
 def test_panel_asks_for_the_surroundings_of_a_single_object(root, session):
     view = views(root)[0]
-    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    session.take({"type": "status", "message": "Comparing the splats"})
+    assert "Comparing the splats" in texts_of(MarkingPanel)
     marks.add_stroke(root, 1, view, [(1, 1), (9, 1)], area=False)
+    assert "Strokes so far are applied when this is done." in texts_of(MarkingPanel)
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     answer(session, [1], [0] * len(session.keys))
     assert "mark what it stands on, too" in texts_of(MarkingPanel)
     marks.add_stroke(root, 2, view, [(5, 5), (9, 5)], area=False)

@@ -99,7 +99,9 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         progress, waits = pointing.state()
         if progress < 1.0:
             layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
-            write(layout, pointing.message(), rows=_ROWS - 1)
+            has_strokes = bool(marks.strokes_of(root))
+            text = "Strokes so far are applied when this is done." if has_strokes else pointing.message()
+            write(layout, text, rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
         strokes = marks.strokes_of(root)
