@@ -151,7 +151,7 @@ class SeparateMarked(_OfMarks, bpy.types.Operator):
         strokes: Path = Reconstruction(folder).strokes
         write_json(strokes, content)
         job = locations.backend_job(
-            f"Objects of {root.name}",
+            f"Separate objects of {root.name}",
             "label",
             folder,
             "label",

@@ -221,6 +221,7 @@ def test_splats_without_a_training_are_marked(root, monkeypatch):
     marks.add_stroke(root, item.object_id, views(root)[0], [(100, 100), (120, 110)], area=False)
     assert bpy.ops.objectgs.separate_marked() == {"FINISHED"}
     (stroke,) = json.loads((folder / "strokes.json").read_text())["strokes"]
+    assert submitted[0].title.startswith("Separate objects of ")
     assert "camera" in stroke and submitted[0].command[submitted[0].command.index("label") + 1] == str(folder)
     with pytest.raises(RuntimeError, match=r"capture|train first"):
         bpy.ops.objectgs.clean_up_labels()
