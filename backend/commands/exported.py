@@ -74,6 +74,7 @@ def _write_export(
         found = agreement(model, splats, [scene.camera(i) for i in views])
         psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
+        reporter.status(f"Writing {folder.splats.name}")
     count, warnings = write_splat_parts(
         folder.splats,
         lambda: (part.splats for part in splats.parts()),
