@@ -93,7 +93,7 @@ def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:
     """Show the cameras and points of a folder in a scene that does not show them yet, and return the collection.
 
     Blender's startup scene is set up for renders through the capture's first camera, its cube, camera and light are
-    hidden, since they would stand in the captured room, and Solid mode shows colors without shading. Any other scene
+    disabled, since they would stand in the captured room, and Solid mode shows colors without shading. Any other scene
     is the user's.
 
     Raises:
@@ -105,8 +105,8 @@ def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:
     if untouched:
         scene.set_up_render(owner, root, replace=True)
         for obj in startup:
-            obj.hide_set(True, view_layer=owner.view_layers[0])
-            obj.hide_render = True
+            # Show Hidden Objects (Alt+H) shows what is only hidden, and the cube would cover the scene.
+            obj.hide_viewport = obj.hide_render = True
         for space in _spaces():
             space.shading.color_type, space.shading.light = "VERTEX", "FLAT"
     if not related:

@@ -290,9 +290,12 @@ def test_startup_scene_alone_is_set_up_by_itself(folder, tmp_path, change):
     if change == "nothing":
         assert blender_scene.render_problem(scene, root) is None
         assert scene.camera.name == "000.png" and (scene.render.resolution_x, scene.render.resolution_y) == SIZE
-        assert all(scene.objects[name].hide_get() and scene.objects[name].hide_render for name in ("Cube", "Light"))
+        for obj in scene.objects:
+            obj.hide_set(False)  # As Show Hidden Objects does.
+        assert not any(scene.objects[name].visible_get() for name in ("Cube", "Light", "Camera"))
+        assert all(scene.objects[name].hide_render for name in ("Cube", "Light"))
     else:
-        assert not any(scene.objects[name].hide_get() for name in ("Cube", "Light", "Camera"))
+        assert all(scene.objects[name].visible_get() for name in ("Cube", "Light", "Camera"))
         assert scene.view_settings.view_transform == "AgX" and scene.camera == before
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
