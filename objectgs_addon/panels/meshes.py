@@ -52,6 +52,9 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
                 "Extract Meshes updates them.",
                 "INFO",
             )
+        if state.meshes and not background.is_busy(root) and scene.meshes_are_newer(root):
+            write(layout, "The meshes in the folder differ from those shown.", "INFO")
+            layout.operator("objectgs.show_result", icon="FILE_REFRESH")
         if not scene.has_shown_meshes(root):
             return
         layout.label(text="Show")

@@ -83,6 +83,12 @@ SEPARATE = Step(
 MESHES = Step(
     "objectgs.extract_meshes", "Extract Meshes", "MESH_DATA", "Meshes are for physics, shadows and other programs."
 )
+RELOAD = Step(
+    "objectgs.show_result",
+    "Reload Result",
+    "FILE_REFRESH",
+    "The meshes in the folder were made after this file was saved; this shows them.",
+)
 CLEAN = Step(
     "objectgs.clean_floaters",
     "Clean Floaters",
@@ -162,6 +168,9 @@ def _next_step(root: bpy.types.Collection | None, owner: bpy.types.Scene) -> Ste
         return CLEAN
     if state.steps and not state.meshes:
         return MESHES
+    # While meshes are made, they wait to be shown together.
+    if state.meshes and not state.waiting_meshes and scene.meshes_are_newer(root):
+        return RELOAD
     return FILM if scene.render_problem(owner, root) is None else SET_UP_RENDER
 
 

@@ -21,6 +21,7 @@ from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.meshes import export as mesh_export
 from objectgs.objectgs_addon.state.folder_state import folder_state
+from objectgs.objectgs_addon.state.next_step import next_step
 
 import headless
 
@@ -790,6 +791,30 @@ def test_interrupted_meshing_is_named_after_reopening(active):
     assert "interrupted, and 2 meshes are missing. Extract Meshes continues" in texts_of(panels.meshes.MeshesPanel)
     with locked(folder):
         assert "interrupted" not in texts_of(panels.meshes.MeshesPanel), "another program makes them"
+
+
+def test_meshes_made_after_saving_are_offered(active, folder, tmp_path):
+    made = {path: path.read_bytes() for path in (folder / "meshes").iterdir()}
+    differ = "The meshes in the folder differ from those shown. objectgs.show_result"
+    assert differ not in texts_of(panels.meshes.MeshesPanel)
+    for path in made:
+        path.unlink()
+    bpy.ops.objectgs.show_result()
+    del active["objectgs_show"], active["objectgs_shown_meshes"]
+    bpy.ops.objectgs.clean_floaters(everything=True)
+    bpy.ops.objectgs.set_up_render()
+    assert differ not in texts_of(panels.meshes.MeshesPanel)
+    for path, content in made.items():
+        path.write_bytes(content)
+    assert differ in texts_of(panels.meshes.MeshesPanel)
+    assert next_step(active, bpy.context.scene).operator == "objectgs.show_result"
+    bpy.ops.objectgs.show_result()
+    assert mesh_of(active, 1).name == "mug mesh" and differ not in texts_of(panels.meshes.MeshesPanel)
+    assert next_step(active, bpy.context.scene).operator == "objectgs.film_frames"
+    rewrite(folder)
+    assert differ in texts_of(panels.meshes.MeshesPanel)
+    del active["objectgs_shown_meshes"]
+    assert differ not in texts_of(panels.meshes.MeshesPanel), "of an older version, whose meshes may be these"
 
 
 def test_folder_state_counts_outdated_meshes(folder):

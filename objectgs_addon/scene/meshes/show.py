@@ -15,11 +15,23 @@ import bpy
 import numpy as np
 
 from ....backend.shared.errors import InputError
+from ....backend.shared.reconstruction.folder import Reconstruction
+from ....backend.shared.reconstruction.meshes import NAME as MESHES
 from .. import carrier
 from ..edits.fills import replace_by_mesh
 from ..edits.recover import recover_parts
 from ..edits.show import show_edits
-from ..kinds import MESH, MESH_KEY, SPLATS, duplicates_of, kind_of, object_collections, object_id_of, parts_of
+from ..kinds import (
+    MESH,
+    MESH_KEY,
+    SPLATS,
+    duplicates_of,
+    folder_of,
+    kind_of,
+    object_collections,
+    object_id_of,
+    parts_of,
+)
 from ..object_collection import remove, remove_if_empty
 from ..object_display import Objects
 from .importing import MeshImporter
@@ -30,6 +42,9 @@ SHOW = "objectgs_show"
 """Custom property of the root collection: the chosen entry of SHOWS."""
 
 SHOWS = ("splats", "meshes", "both")
+
+SHOWN = "objectgs_shown_meshes"
+"""Custom property of the root collection: the modification time of the meshes.json that is shown."""
 
 
 @dataclass
@@ -66,6 +81,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
         InputError: meshes.json or objects.json cannot be used, or a mesh is in Edit Mode; nothing is changed.
     """
     folder = Path(folder)
+    written = _written(folder)
     listed = read_listed(folder)
     objects = Objects.read(folder)
     recover_parts(root)
@@ -74,6 +90,7 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     if not listed and not existing:
         return ShownMeshes()
     carrier.require_object_mode(existing.values())
+    root[SHOWN] = written
     before = _has_meshes(root)
     root[SHADING] = shading_of(root)
     assigned, warnings = assign_to_collections(listed, objects)
@@ -102,6 +119,23 @@ def update_meshes(root: bpy.types.Collection, folder: Path) -> ShownMeshes:
     for object_id in importer.new:
         root.children.link(collections[object_id])
     return shown
+
+
+def meshes_are_newer(root: bpy.types.Collection) -> bool:
+    """Return whether the folder's meshes.json differs in modification time from the one shown.
+
+    Files of older versions do not know the time; theirs differs if they have never shown meshes.
+    """
+    written = _written(folder_of(root))
+    return bool(written) and (root[SHOWN] != written if SHOWN in root else not has_shown_meshes(root))
+
+
+def _written(folder: Path) -> str:
+    """Return the modification time of meshes.json in ns, as a string since Blender's integers have 32 bits, or ""."""
+    try:
+        return str((Reconstruction(folder).meshes / MESHES).stat().st_mtime_ns)
+    except OSError:
+        return ""
 
 
 def has_shown_meshes(root: bpy.types.Collection) -> bool:
