@@ -21,6 +21,7 @@ OBJECT_ID = "object_id"
 FOLDER = "objectgs_folder"
 RELATIVE_FOLDER = "objectgs_relative_folder"  # The folder relative to the .blend when it was saved.
 MESH_KEY = "objectgs_mesh"  # Key of a mesh in meshes.json.
+MESH_COLORS = "Col"  # Color attribute of a mesh with the captured colors.
 
 RECONSTRUCTION = "reconstruction"
 PARENT = "parent"

@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -221,6 +222,37 @@ def test_texture_recolor_is_applied_and_reverted(root):
     bpy.ops.objectgs.reset_object(what="COLORS")
     assert sorted((link.from_socket.name, link.to_socket.name) for link in tree.links) == before
     assert not [node for node in tree.nodes if node.type == "GROUP"]
+
+
+def test_solid_mode_shows_recolored_meshes(root, folder):
+    def shown():
+        colors = np.empty(4 * len(mesh.data.vertices), np.float32)
+        mesh.data.color_attributes.active_color.data.foreach_get("color_srgb", colors)
+        return colors.reshape(-1, 4)[:, :3]
+
+    mesh = part(root, "mesh")
+    captured = shown()
+    bpy.ops.objectgs.duplicate_object()
+    for amount in (0.3, 0.6):
+        set_sliders(root, replace(RECOLOR, amount=amount))
+        wanted = np.clip(expected(captured, object_list.recolor_of(item(root))), 0.0, 1.0)
+        assert np.abs(wanted - captured).max() > 0.1
+        assert shown() == pytest.approx(wanted, abs=1 / 255)
+    write_meshes(folder, {"1": tetrahedron(ORIGIN + 0.5)})
+    bpy.ops.objectgs.show_result()
+    assert shown() == pytest.approx(wanted, abs=1 / 255), "a mesh that is made later is recolored, too"
+    bpy.ops.objectgs.reset_object(what="COLORS")
+    assert shown() == pytest.approx(captured) and len(mesh.data.color_attributes) == 1
+
+
+def test_vertex_colors_of_the_user_stay_shown(root):
+    mesh = part(root, "mesh").data
+    mesh.color_attributes.active_color = mesh.color_attributes.new("own", "BYTE_COLOR", "CORNER")
+    set_sliders(root)
+    assert mesh.color_attributes.active_color_name == "own"
+    mesh.color_attributes.remove(mesh.color_attributes["Col"])
+    item(root).hue = 0.4
+    assert [each.name for each in mesh.color_attributes] == ["own"]
 
 
 def test_rendered_texture_has_recolored_color(root):

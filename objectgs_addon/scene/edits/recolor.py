@@ -14,7 +14,7 @@ import numpy as np
 from ....backend.shared.color.recolor import Recolor, average_luma
 from ....backend.shared.splats.spherical_harmonics import C0
 from .. import carrier
-from ..kinds import MESH, SPLATS, TEXTURE, kind_of, part_of, parts_of
+from ..kinds import MESH, MESH_COLORS, SPLATS, TEXTURE, kind_of, part_of, parts_of
 from ..object_collection import our_materials
 from ..shading.color_nodes import CHANNELS, OFFSET, encoded_channel, linear_channel, recolor_inputs, recolored
 from ..shading.graph import Graph, find_or_make
@@ -25,6 +25,9 @@ RECOLOR = "objectgs_recolor"
 """Custom property of an object's collection: its recoloring from objects.json, as JSON."""
 
 TEXTURE_GROUP = "texture_recolor"
+
+RECOLORED = "Recolored"
+"""Color attribute of a recolored object's meshes, which Solid mode shows instead of the captured colors."""
 
 
 def recolor_of(collection: bpy.types.Collection) -> Recolor | None:
@@ -47,6 +50,7 @@ def set_recolor(collection: bpy.types.Collection, recolor: Recolor | None) -> No
         elif kind_of(obj) == MESH:
             for material in our_materials(obj):
                 _recolor_textures(material, affine)
+            _recolor_vertices(obj.data, affine)
 
 
 def luma_of(collection: bpy.types.Collection) -> float:
@@ -56,6 +60,33 @@ def luma_of(collection: bpy.types.Collection) -> float:
         return average_luma(np.zeros((0, 3)), np.zeros(0))
     base = carrier.read(obj.data, "radiance:base")[~unobserved_splats(obj.data)].astype(np.float64)
     return average_luma(0.5 + C0 * base[:, :3], base[:, 3])
+
+
+def _recolor_vertices(mesh: bpy.types.ID, affine: tuple[np.ndarray, np.ndarray] | None) -> None:
+    """Show a mesh's vertex colors mapped in a color attribute of its own; None shows the captured ones and removes it.
+
+    A mesh in Edit Mode, where attributes cannot be written, and one that the user has converted are left as they are.
+    """
+    if not isinstance(mesh, bpy.types.Mesh) or mesh.is_editmode:
+        return
+    attributes = mesh.color_attributes
+    is_shown = attributes.active_color_name in (MESH_COLORS, RECOLORED)
+    before = attributes.get(RECOLORED)
+    if before is not None:
+        attributes.remove(before)
+    captured = attributes.get(MESH_COLORS)
+    if captured is None:
+        return
+    if affine is not None:
+        colors = np.empty((len(captured.data), 4), np.float32)
+        captured.data.foreach_get("color_srgb", colors.reshape(-1))
+        matrix, offset = affine
+        colors[:, :3] = np.clip(colors[:, :3] @ matrix.T + offset, 0.0, 1.0)
+        mapped = attributes.new(RECOLORED, captured.data_type, captured.domain)
+        mapped.data.foreach_set("color_srgb", colors.reshape(-1))
+    if is_shown:
+        attributes.active_color_name = MESH_COLORS if affine is None else RECOLORED
+    mesh.update_tag()
 
 
 def _recolor_textures(material: bpy.types.Material, affine: Any) -> None:

@@ -15,7 +15,7 @@ from ....backend.shared.formats.splat_ply import UNOBSERVED
 from .. import carrier
 from ..capture import origin_of
 from ..edits.placement import attach, move_to_transforms
-from ..kinds import ANCHORS, MESH, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of, part_of
+from ..kinds import ANCHORS, MESH, MESH_COLORS, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of, part_of
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
 from ..object_display import Objects
 from ..shading.materials import mesh_material
@@ -26,7 +26,7 @@ from .textures import load_texture, reload_texture
 WRITTEN = "objectgs_written"
 """Custom property of a mesh object: the stamps of the mesh file and the texture that it shows, with a space between."""
 
-UV_MAP, COLORS = "UVMap", "Col"
+UV_MAP = "UVMap"
 
 
 class MeshImporter:
@@ -175,7 +175,7 @@ def fill_mesh(mesh: bpy.types.Mesh, positions: np.ndarray, loaded: Mesh) -> None
     mesh.loops.foreach_set("vertex_index", np.ascontiguousarray(loaded.faces, np.int32).reshape(-1))
     uvs = mesh.uv_layers.new(name=UV_MAP, do_init=False)
     uvs.uv.foreach_set("vector", np.nan_to_num(loaded.uvs).astype(np.float32).reshape(-1))
-    colors = mesh.color_attributes.new(COLORS, "BYTE_COLOR", "POINT")
+    colors = mesh.color_attributes.new(MESH_COLORS, "BYTE_COLOR", "POINT")
     rgba = np.ones((len(positions), 4), np.float32)
     rgba[:, :3] = loaded.colors / np.float32(255.0)
     colors.data.foreach_set("color_srgb", rgba.reshape(-1))
