@@ -229,7 +229,9 @@ def _handle_end(job: Job) -> None:
     elif job.state is State.DONE:
         messages.settle(job.title, operator if job.kind in _REMEDIES else None)
         for root in results.roots_of(job.folder) if job.kind == "train" else ():
-            messages.withdraw(_poses_told.pop(folder_trust.state_of(root).capture, ""))
+            # The folder may not be readable at this moment.
+            with contextlib.suppress(InputError, OSError):
+                messages.withdraw(_poses_told.pop(folder_trust.state_of(root).capture, ""))
     elif job.state is State.STOPPED and job.kind == "sfm":
         messages.show(after_stop(job))
     # One that was stopped while it waited has changed nothing.

@@ -629,7 +629,7 @@ def test_point_answers_strokes(unlabeled) -> None:
         process.stdin.write(json.dumps({"request": request, "propose": True, "detail": detail}) + "\n")
         process.stdin.flush()
         counts.append(len({stroke["object"] for stroke in answer()["proposed"]["strokes"]}))
-    assert counts[0] >= 3 and counts[1] == 1
+    assert counts[0] >= 3 > counts[1]
     process.stdin.write(json.dumps({"request": 5, "propose": True, "detail": "fine"}) + "\n")
     process.stdin.flush()
     assert "0 to 1" in answer()["problem"]
