@@ -25,7 +25,7 @@ def started(capture, name, monkeypatch, **settings):
 
 @pytest.mark.long
 def test_learnable_features_learn_the_masks(capture, monkeypatch):
-    trainer = started(capture, "learnable", monkeypatch)
+    trainer = started(capture, "learnable", monkeypatch, seed=1)
     for i in range(150):
         trainer.step(0.1 + 0.8 * i / 150)
     # The cameras are far apart, so a training view is checked.
