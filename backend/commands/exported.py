@@ -58,7 +58,7 @@ def export_model(
 def _write_export(
     model: ObjectModel, scene: Scene, folder: Reconstruction, reporter: Reporter, compare: bool
 ) -> ExportRecord:
-    reporter.begin(EXPORT, f"Writing {folder.splats.name}")
+    reporter.begin(EXPORT, "Turning the anchors into splats")
     capture = scene.capture
     splats: ModelSplats
     if model.explicit:
@@ -74,7 +74,7 @@ def _write_export(
         found = agreement(model, splats, [scene.camera(i) for i in views])
         psnr, on_black = plain(found) or (None, None)
         _say_how_well(model, folder, capture, psnr, on_black, reporter)
-        reporter.status(f"Writing {folder.splats.name}")
+    reporter.status(f"Writing {folder.splats.name}")
     count, warnings = write_splat_parts(
         folder.splats,
         lambda: (part.splats for part in splats.parts()),
