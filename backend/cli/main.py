@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TextIO
 
 from ..shared.console import ConsoleReporter
+from ..shared.durations import awake_seconds
 from ..shared.errors import (
     EXIT_BAD_INPUT,
     EXIT_CANCELLED,
@@ -107,7 +108,8 @@ def _run(arguments: list[str], reporter: Reporter) -> int:
                 run = command_of(options.command)
                 stack.enter_context(stop.listening(read_stdin=options.json and owns_stdin()))
             set_threads(options.threads)
-            run(options, StoppingReporter(StagedReporter(reporter), stop))
+            staged = StagedReporter(reporter, lambda: awake_seconds() - stop.paused_seconds)
+            run(options, StoppingReporter(staged, stop))
         return EXIT_DONE
     except (InputError, UsageError) as error:
         fields = error.fields if isinstance(error, InputError) else {}

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..capture import Capture
+from ..shared.durations import Limit
 from ..shared.errors import InputError
 from ..shared.expectation import DEFAULT_SECONDS, NANOSECONDS_A_PIXEL, expectation, expected_psnr, typical_psnr
 from ..training.budget import LOOKAHEAD, PRESETS, WARM_UP, Budget, TrainingProgress
@@ -77,9 +78,9 @@ def _length(
 
 
 def training_seconds(budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress) -> float:
-    """Return about how long the rest of a training takes, for the progress of the whole command."""
+    """Return about how long the rest of a training takes, for the progress of the whole command; may be a `Limit`."""
     if budget.seconds is not None and not budget.until_converged:
-        return max(budget.seconds - done.seconds, 0.0)
+        return Limit(max(budget.seconds - done.seconds, 0.0))
     if done.step:
         pace = done.seconds / done.step
     else:

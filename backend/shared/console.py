@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any, TextIO
 
-from .durations import time_left
+from .durations import counted_down, time_left
 from .events import Reporter
 from .reconstruction.report import MIOU_LABELS, lead_miou
 
 SECONDS_BETWEEN_LINES = 5.0
 SECONDS_BETWEEN_REDRAWS = 0.1
+SECONDS_BETWEEN_COUNTS = 1.0
+"""Between two redraws of a bar without an event."""
 BAR_COLUMNS = 30
 
 
@@ -52,7 +56,10 @@ class ConsoleReporter(Reporter):
         self.on_terminal = self.stream.isatty()
         self._bar = ""
         """The progress bar on screen; empty if there is none."""
-        self._started = time.monotonic()
+        self._done = 0.0
+        self._left: float | None = None
+        self._lock = threading.RLock()
+        self._ended = threading.Event()
         self._last_line = -SECONDS_BETWEEN_LINES
         self._kept: dict[str, Any] = {}
         self._preview_folder: Path | None = None
@@ -70,18 +77,14 @@ class ConsoleReporter(Reporter):
         if now - self._last_line < interval and not finished:
             return
         self._last_line = now
-        seconds_left = fields.get("seconds_left")
-        if seconds_left is None and 0 < done <= total:
-            seconds_left = (now - self._started) * (total - done) / done
-        left = [] if seconds_left is None or finished else [time_left(seconds_left)]
-        text = ", ".join(left + _figures(self._kept))
+        self._done, self._left = done / total if total else 1.0, None if finished else fields.get("seconds_left")
         if self.on_terminal:
-            self._draw_bar(done / total if total else 1.0, text)
+            self._draw_bar()
             if finished:
                 self._end_bar()
         else:
             percentage = f"{100 * done / total:3.0f}%" if total else "    "
-            self._print(f"  {percentage}  {text}".rstrip(), self.stream)
+            self._print(f"  {percentage}  {self._text()}".rstrip(), self.stream)
 
     def preview(self, path: Path, **_fields: Any) -> None:
         """Print the folder of the preview images once instead of each image."""
@@ -113,32 +116,54 @@ class ConsoleReporter(Reporter):
     def close(self) -> None:
         """End the bar, so that other text can follow; later progress starts a new one."""
         self._end_bar()
-        self._started = time.monotonic()
         self._last_line = -SECONDS_BETWEEN_LINES
         self._kept = {}
 
-    def _draw_bar(self, progress: float, text: str) -> None:
-        columns = shutil.get_terminal_size().columns - 1
-        width = min(BAR_COLUMNS, max(5, columns - 11 - len(text)))
-        filled = round(width * min(max(progress, 0.0), 1.0))
-        line = f"  {100 * progress:3.0f}% |{(_block(self.stream) * filled).ljust(width)}| {text}"[:columns]
-        # Spaces overwrite the rest of a longer previous line.
-        self.stream.write("\r" + line.ljust(len(self._bar)))
-        self.stream.flush()
-        self._bar = line
+    def _text(self) -> str:
+        """Return the time left, counted down since the last event, and the figures."""
+        passed = time.monotonic() - self._last_line
+        left = [] if self._left is None else [time_left(counted_down(self._left, passed))]
+        return ", ".join(left + _figures(self._kept))
+
+    def _draw_bar(self) -> None:
+        """Draw the bar, at intervals also without an event, until it ends."""
+        with self._lock:
+            text = self._text()
+            columns = shutil.get_terminal_size().columns - 1
+            width = min(BAR_COLUMNS, max(5, columns - 11 - len(text)))
+            filled = round(width * min(max(self._done, 0.0), 1.0))
+            line = f"  {100 * self._done:3.0f}% |{(_block(self.stream) * filled).ljust(width)}| {text}"[:columns]
+            # Spaces overwrite the rest of a longer previous line.
+            self.stream.write("\r" + line.ljust(len(self._bar)))
+            self.stream.flush()
+            if not self._bar:
+                self._ended = threading.Event()
+                threading.Thread(target=self._redraw, args=(self._ended,), daemon=True).start()
+            self._bar = line
+
+    def _redraw(self, ended: threading.Event) -> None:
+        """Count the time left down until the bar ends."""
+        with contextlib.suppress(OSError, ValueError):  # The stream is closed.
+            while not ended.wait(SECONDS_BETWEEN_COUNTS):
+                with self._lock:
+                    if not ended.is_set():
+                        self._draw_bar()
 
     def _end_bar(self) -> None:
         """Keep the bar on screen and move to the next line."""
-        if self._bar:
-            print(file=self.stream, flush=True)
-            self._bar = ""
+        with self._lock:
+            if self._bar:
+                self._ended.set()
+                print(file=self.stream, flush=True)
+                self._bar = ""
 
     def _print(self, text: str, stream: TextIO) -> None:
         """Print a line; a bar on screen is erased and redrawn below it."""
-        if self._bar:
-            self.stream.write("\r" + " " * len(self._bar) + "\r")
-            self.stream.flush()
-        print(text, file=stream, flush=True)
-        if self._bar:
-            self.stream.write(self._bar)
-            self.stream.flush()
+        with self._lock:
+            if self._bar:
+                self.stream.write("\r" + " " * len(self._bar) + "\r")
+                self.stream.flush()
+            print(text, file=stream, flush=True)
+            if self._bar:
+                self.stream.write(self._bar)
+                self.stream.flush()

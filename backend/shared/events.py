@@ -5,17 +5,12 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TextIO
 
+from .durations import Estimate, awake_seconds
 from .formats.json_file import plain
-
-_MOST = 0.99
-"""Progress of a command whose parts are all complete, but which has not ended."""
-_PACED_FROM = 0.05
-_PACED_AFTER = 2.0
-"""Fraction and time in seconds of a part from which on its pace tells the time left."""
 
 
 class Reporter:
@@ -65,62 +60,50 @@ class StagedReporter(Reporter):
 
     The user sees stages, each of one or more parts. A command calls `expect` with part -> (stage, expected seconds), in
     the order in which they run, and `begin` for each part that takes place; the seconds of parts that have not begun
-    may be corrected by another `expect`. A part that begins gets its share of the remaining progress in proportion to
-    the expected seconds, so the progress of the command never decreases, and it stays below 1 until the command ends.
+    may be corrected by another `expect`. Seconds that are a `Limit` are those of any computer. The progress of the
+    command never decreases, and it stays below 1 until the command ends.
 
     Each status has the fields `stage`, `number` and `of`, if there are several stages. `seconds_left` of progress is
-    the rest of the part, as reported, from its pace or as expected, and the expected seconds of the later parts.
+    the time left of the whole command as `Estimate` knows it, or None; a part may report its own.
+
+    Args:
+        reporter: Receives the events.
+        clock: Returns a time in seconds that stands still while the command is paused.
     """
 
-    def __init__(self, reporter: Reporter) -> None:
+    def __init__(self, reporter: Reporter, clock: Callable[[], float] = awake_seconds) -> None:
         self._reporter = reporter
-        self._parts: dict[str, tuple[str, float]] = {}
-        self._part = ""
-        self._shown = self._before = self._share = self._began = 0.0
+        self._stages: dict[str, str] = {}
+        self._estimate = Estimate(clock)
 
     def expect(self, parts: Mapping[str, tuple[str, float]]) -> None:
-        self._parts.update(parts)
+        self._stages.update({part: stage for part, (stage, _) in parts.items()})
+        self._estimate.expect({part: seconds for part, (_, seconds) in parts.items()})
 
     def begin(self, part: str, message: str) -> None:
-        if part in self._parts:
-            # The part before is complete, whether or not it reported so.
-            self._shown = max(self._shown, self._before + self._share)
-            self._part, self._before, self._began = part, self._shown, time.monotonic()
-            seconds = self._parts[part][1]
-            self._share = (_MOST - self._shown) * seconds / max(seconds + self._later(), 1e-9)
+        left = self._estimate.begin(part) if part in self._stages else None
         self.status(message)
-        if part in self._parts:
-            self.progress(0, 1)
+        if part in self._stages:
+            self._tell(left)
 
     def status(self, message: str, **stage: Any) -> None:
-        names = list(dict.fromkeys(name for name, _ in self._parts.values()))
-        if self._part and len(names) > 1 and not stage:
-            name = self._parts[self._part][0]
+        names = list(dict.fromkeys(self._stages.values()))
+        if self._estimate.part and len(names) > 1 and not stage:
+            name = self._stages[self._estimate.part]
             stage = {"stage": name, "number": names.index(name) + 1, "of": len(names)}
         self._reporter.status(message, **stage)
 
     def progress(self, done: float, total: float, **fields: Any) -> None:
-        if not self._part:
+        if not self._estimate.part:
             self._reporter.progress(done, total, **fields)
             return
         fraction = min(max(done / total, 0.0), 1.0) if total > 0 else 0.0
-        self._shown = max(self._shown, self._before + self._share * fraction)
-        fields["seconds_left"] = round(self._left(fraction, fields.get("seconds_left")) + self._later(), 1)
-        self._reporter.progress(round(self._shown, 5), 1.0, **fields)
+        left = self._estimate.advance(fraction, fields.pop("seconds_left", None))
+        self._tell(left, **fields)
 
-    def _left(self, fraction: float, reported: float | None) -> float:
-        """Estimate the remaining seconds of the part."""
-        if reported is not None:
-            return reported
-        expected, spent = self._parts[self._part][1], time.monotonic() - self._began
-        if fraction >= _PACED_FROM and spent >= _PACED_AFTER:
-            return spent * (1 - fraction) / fraction
-        return max(expected - spent, 0.0)
-
-    def _later(self) -> float:
-        """Return the expected seconds of the parts after the current one."""
-        names = list(self._parts)
-        return sum(self._parts[name][1] for name in names[names.index(self._part) + 1 :])
+    def _tell(self, left: float | None, **fields: Any) -> None:
+        seconds_left = None if left is None else round(left, 1)
+        self._reporter.progress(round(self._estimate.progress, 5), 1.0, seconds_left=seconds_left, **fields)
 
     def preview(self, path: Path, **fields: Any) -> None:
         self._reporter.preview(path, **fields)

@@ -14,6 +14,7 @@ from queue import SimpleQueue
 from types import FrameType
 from typing import Any
 
+from .durations import awake_seconds
 from .errors import Cancelled
 from .events import Reporter
 from .signals import STOPPING
@@ -40,6 +41,7 @@ class StopRequest:
 
     Attributes:
         requests: Other lines of standard input that begin with `{`, for commands that answer requests.
+        paused_seconds: Time for which calls have waited so far.
     """
 
     def __init__(self, announce: Callable[[str], None] = lambda _: None) -> None:
@@ -48,12 +50,15 @@ class StopRequest:
         self._stopped = False
         self._paused = False
         self.requests: SimpleQueue[str] = SimpleQueue()
+        self.paused_seconds = 0.0
 
     def __call__(self) -> bool:
         if self.paused:
             self._announce("Paused")
+            began = awake_seconds()
             while self.paused:
                 time.sleep(_ASKED_EVERY)
+            self.paused_seconds += awake_seconds() - began
             if not self._stopped:
                 self._announce("Resumed")
         return self._stopped

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from types import FrameType
 
+from ...backend.shared.durations import time_left
 from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED
 from ...backend.shared.events import Reporter
 from .jobs import Job, State
@@ -59,7 +60,8 @@ def _counted_signals() -> Iterator[list[int]]:
 
 def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
     """Poll the job until it ends, and report changes."""
-    handled, reported, warned, progress = 0, 0, 0, 0.0
+    handled, reported, warned = 0, 0, 0
+    told: tuple[float, str] | None = None
     while not job.is_finished:
         if len(signals) > handled:
             handled += 1
@@ -71,10 +73,11 @@ def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
         for warning in job.warnings[warned:]:
             reporter.warning(warning)
         warned = len(job.warnings)
-        if job.progress != progress:
-            progress = job.progress
+        left = "" if job.seconds_left is None else time_left(job.seconds_left)
+        if job.progress and (job.progress, left) != told:
+            told = job.progress, left
             reporter.progress(
-                progress, 1.0, seconds_left=job.seconds_left, splats=job.splats, psnr=job.psnr, miou=job.miou,
+                job.progress, 1.0, seconds_left=job.seconds_left, splats=job.splats, psnr=job.psnr, miou=job.miou,
                 miou_all=job.miou_all, zero_is_background=job.zero_is_background,
             )  # fmt: skip
         time.sleep(0.02)

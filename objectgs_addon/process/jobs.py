@@ -16,6 +16,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+from ...backend.shared.durations import counted_down
 from ...backend.shared.errors import EXIT_CANCELLED, EXIT_DONE
 from ...backend.shared.formats.regular_file import resolved
 from .backend_process import BackendProcess
@@ -28,8 +29,6 @@ _LARGEST_NUMBER = 1e15
 """Largest number of an event that is taken as one; integers in JSON can be too large to convert or to show."""
 _MOST = 0.99
 """Progress of a job that has not ended."""
-_ESTIMATE_FROM = 0.02
-_ESTIMATE_AFTER = 1.0
 _ENDING_SECONDS = 3.0
 _SETTLING = 0.1
 _SETTLING_AT_MOST = 10.0
@@ -65,8 +64,8 @@ class Job:
         environment: additional environment variables.
         if_silent: error message if the program ends without any event, because it is not the expected program.
 
-    The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left (reported
-    or estimated, without its jumps), stage (such as "Preparing (1 of 3)", or empty), message (the current step),
+    The other attributes change while the job runs: progress from 0 to 1, which never decreases, seconds_left (None as
+    long as it is not known), stage (such as "Preparing (1 of 3)", or empty), message (the current step),
     statuses (all messages so far), warnings and error (sentences), lacks (a missing package and the option that needs
     it), nothing_made (the input was valid, but the command could make nothing of it), in_use (another process uses the
     folder), training figures (step, splats, anchors, psnr, miou, miou_all, zero_is_background), preview (path of the
@@ -84,7 +83,6 @@ class Job:
 
     state: State = State.WAITING
     progress: float = 0.0
-    seconds_left: float | None = None
     stage: str = ""
     message: str = ""
     statuses: list[str] = field(default_factory=list)
@@ -113,7 +111,7 @@ class Job:
     _answered: bool = field(default=False, repr=False)
     _done: bool = field(default=False, repr=False)
     _killed: bool = field(default=False, repr=False)
-    _began: float = field(default=0.0, repr=False)
+    _left: float | None = field(default=None, repr=False)
     _estimated_at: float = field(default=0.0, repr=False)
     _paused_at: float | None = field(default=None, repr=False)
     _stop_asked: float | None = field(default=None, repr=False)
@@ -142,6 +140,11 @@ class Job:
     def is_finished(self) -> bool:
         """Whether the job has ended."""
         return self.state in FINISHED
+
+    @property
+    def seconds_left(self) -> float | None:
+        """The time left as reported, but without its jumps, and counted down since then; None if it is not known."""
+        return None if self._left is None else counted_down(self._left, time.monotonic() - self._estimated_at)
 
     @property
     def can_pause(self) -> bool:
@@ -206,7 +209,6 @@ class Job:
                 self.error = f"The folder {self.cwd} is missing; install the extension again."
             self._set(State.FAILED, self.error)
             return
-        self._began = time.monotonic()
         self._set(State.RUNNING, "Starting")
 
     def poll(self) -> bool:
@@ -234,11 +236,9 @@ class Job:
             self.message = message
 
     def _shift_clock(self) -> None:
-        """Exclude the pause from the elapsed time of the estimate."""
+        """Exclude the pause from the time in which the time left is counted down."""
         if self._paused_at is not None:
-            paused = time.monotonic() - self._paused_at
-            self._began += paused
-            self._estimated_at += paused
+            self._estimated_at += time.monotonic() - self._paused_at
             self._paused_at = None
 
     def _take(self, event: dict[str, Any]) -> None:
@@ -279,19 +279,17 @@ class Job:
             return
         self.progress = max(self.progress, min(max(done / total, 0.0), _MOST))
         left = _number(event.get("seconds_left"))
-        elapsed = time.monotonic() - self._began
-        if left is None and self.progress >= _ESTIMATE_FROM and elapsed >= _ESTIMATE_AFTER:
-            left = elapsed * (1 - self.progress) / self.progress
-        self.seconds_left = None if left is None else self._steady(max(left, 0.0))
+        if left is None:
+            self._left = None
+        else:
+            self._left, self._estimated_at = self._steady(max(left, 0.0)), time.monotonic()
 
     def _steady(self, left: float) -> float:
         """Return the time left without jumps: it counts down, and is drawn to the estimates, faster near the end."""
-        now, before = time.monotonic(), self.seconds_left
-        passed = max(now - self._estimated_at, 0.0)
-        self._estimated_at = now
-        if before is None:
+        expected = self.seconds_left
+        if expected is None:
             return left
-        expected = max(before - passed, 0.0)
+        passed = max(time.monotonic() - self._estimated_at, 0.0)
         constant = min(max(_SETTLING * (left + expected) / 2, 1.0), _SETTLING_AT_MOST)
         return left + (expected - left) * math.exp(-passed / constant)
 
@@ -308,7 +306,7 @@ class Job:
         self.exit_code = code
         self.stage = ""
         self.log = self._child.log
-        self.seconds_left = None
+        self._left = None
         if self._done and not self.result.get("stopped"):
             if code != EXIT_DONE and not self._killed:
                 self.warnings.append(f"The backend {_how_it_ended(code)} after it was done.")

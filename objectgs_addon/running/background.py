@@ -30,7 +30,7 @@ from ..state import folder_trust, object_edits, object_list
 from ..state.folder_state import reconstruction_for
 from ..state.next_step import find_step, has_masks, is_capture_gone
 from . import pointing, previews, results
-from .job_display import after_stop
+from .job_display import after_stop, summary
 from .wording import IMPORT_PHOTOS, INSTALL, TRANSFORMERS, in_blender, lacking
 
 INTERVAL = 0.1
@@ -52,6 +52,8 @@ _REMEDIES: dict[str, tuple[str, str, dict[str, Any]]] = {
 queue = JobQueue()
 _drawn = 0.0
 _stale = False
+_summary = ""
+"""State of the running job in words, whose time left falls with the clock."""
 _submitted_in: dict[Job, int] = {}
 """Job -> session UID of the scene that submitted it; unlike the name, the UID never changes."""
 _results: list[Job] = []
@@ -181,6 +183,7 @@ def busy(folder: Path) -> bool:
 
 @writing.allowed
 def _tick() -> float | None:
+    global _summary
     changed = queue.poll()
     for job in changed:
         if job.take_preview() and job.folder is not None:
@@ -188,7 +191,9 @@ def _tick() -> float | None:
         if job.is_finished:
             _guard(job, _handle_end, job)
     _show_results()
-    _redraw_soon(any(job.is_finished or job.state is not State.RUNNING for job in changed), bool(changed))
+    before, _summary = _summary, "" if queue.running is None else summary(queue.running)
+    at_once = any(job.is_finished or job.state is not State.RUNNING for job in changed)
+    _redraw_soon(at_once, bool(changed) or _summary != before)
     return INTERVAL if _results or any(not job.is_finished for job in queue.jobs) else None
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import io
 import re
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from backend.shared import console
 from backend.shared.console import ConsoleReporter
-from backend.shared.durations import clock
+from backend.shared.durations import clock, counted_down, time_left
 
 
 class Terminal(io.StringIO):
@@ -21,9 +23,9 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def now(monkeypatch):
     """A clock that the test sets."""
-    time = [100.0]
-    monkeypatch.setattr(console.time, "monotonic", lambda: time[0])
-    return time
+    seconds = [100.0]
+    monkeypatch.setattr(console, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
+    return seconds
 
 
 def reporter(stream=None):
@@ -57,12 +59,36 @@ def test_log_file_gets_few_plain_lines(now):
     assert lines[-2] == "  100%  loss 0.5000, 12,345 splats"
 
 
-def test_missing_time_left_is_estimated(now):
+def test_time_left_is_not_shown_until_it_is_known(now):
     out = reporter()
     out.status("Evaluating")
     now[0] += 10
     out.progress(1, 4)
-    assert "25%  0:30 left" in out.stream.getvalue()
+    assert out.stream.getvalue().splitlines()[-1] == "   25%"
+
+
+def test_bar_counts_down_between_events(now, monkeypatch):
+    monkeypatch.setattr(console, "SECONDS_BETWEEN_COUNTS", 0.01)
+    out = reporter(Terminal())
+    out.progress(1, 4, seconds_left=120)
+    now[0] += 30
+    deadline = time.monotonic() + 30
+    while "1:30 left" not in out.stream.getvalue() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert "2:00 left" in out.stream.getvalue() and "1:30 left" in out.stream.getvalue()
+    out.close()
+    ended = out.stream.getvalue()
+    now[0] += 30
+    time.sleep(0.05)
+    assert out.stream.getvalue() == ended
+
+
+def test_time_left_is_rounded_to_what_it_is_worth():
+    assert [time_left(seconds) for seconds in (0, 59, 61, 352, 601, 1234, 3700, 8000)] == [
+        "less than a minute", "less than a minute", "1:00 left", "5:45 left", "10:00 left", "21:00 left",
+        "1:00:00 left", "2:15:00 left",
+    ]  # fmt: skip
+    assert [counted_down(100, passed) for passed in (0, 30, 80, 400)] == [100, 70, 20, 100]
 
 
 def test_occasional_figures_stay_displayed(now):
@@ -71,12 +97,11 @@ def test_occasional_figures_stay_displayed(now):
     for fields in ({"psnr": 30.04, "miou": 0.9}, {"psnr": None}, {"loss": 0.1}):
         now[0] += 6
         out.progress(1, 10, seconds_left=5, **fields)
-    assert (
-        out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left, loss 0.1000, PSNR 30.0 dB, mIoU (labeled) 0.900"
-    )
+    figures = "less than a minute, loss 0.1000, PSNR 30.0 dB, mIoU (labeled) 0.900"
+    assert out.stream.getvalue().splitlines()[-1] == f"   10%  {figures}"
     out.status("Meshing")
     out.progress(1, 10, seconds_left=5)
-    assert out.stream.getvalue().splitlines()[-1] == "   10%  0:05 left"
+    assert out.stream.getvalue().splitlines()[-1] == "   10%  less than a minute"
 
 
 def test_warnings_and_errors_use_error_stream():

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from backend.commands.setup import kernels
-from backend.shared import events
+from backend.shared.durations import Limit
 from backend.shared.events import Reporter, StagedReporter
 from backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot, write_shot
 
@@ -98,7 +98,7 @@ def check_events(found: list[dict]) -> None:
     assert shares and shares == sorted(shares)
     assert shares[0] == 0 and 0.2 < shares[-1] < 1
     left = [event["seconds_left"] for event in found if event["type"] == "progress"]
-    assert all(seconds >= 0 for seconds in left)
+    assert all(seconds is None or seconds >= 0 for seconds in left)
 
 
 def stages_of(found: list[dict]) -> list[str]:
@@ -158,27 +158,87 @@ class Recorder(Reporter):
         self.events.append({"type": "progress", "done": done, "total": total, **fields})
 
 
-def test_time_left_follows_the_pace_and_expects_later_parts(monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(events.time, "monotonic", lambda: clock[0])
-    recorder = Recorder()
-    staged = StagedReporter(recorder)
-    staged.expect({"a": ("First", 10.0), "skipped": ("First", 50.0), "b": ("Second", 30.0)})
+PREPARES = {"read": 5.0, "compile": 60.0, "fit": Limit(90.0), "write": 10.0}
+MATCHES = {"read": 2.0, "find": 30.0, "match": 40.0, "skipped": 5.0, "map": 30.0, "dense": 40.0}
+
+
+@pytest.mark.parametrize("expected", [PREPARES, MATCHES], ids=["with a limit", "without"])
+@pytest.mark.parametrize("slow", [1 / 3, 1, 3, 10])
+def test_time_left_learns_how_slow_a_computer_is(expected, slow):
+    """Of a command whose parts take `slow` times as long as expected; "map" reports no progress."""
+    now, recorder = [0.0], Recorder()
+    staged = StagedReporter(recorder, lambda: now[0])
+    staged.expect({part: ("", seconds) for part, seconds in expected.items()})
+    take = {part: seconds if isinstance(seconds, Limit) else slow * seconds for part, seconds in expected.items()}
+    take.pop("skipped", None)
+    total, ends, shown = sum(take.values()), 0.0, []
+    for part, seconds in take.items():
+        staged.begin(part, "")
+        for tick in range(200):
+            now[0] = ends + seconds * tick / 200
+            staged.progress(0 if part == "map" else tick, 200)
+            event = recorder.events[-1]
+            shown.append((seconds, now[0], event["done"], event["seconds_left"]))
+        ends += seconds
+    weights, times, done, left = np.array(shown, float).T
+    known = ~np.isnan(left)
+    assert np.average(known, weights=weights) > 0.75
+    error = np.abs(left + times - total)[known]
+    assert np.average(error, weights=weights[known]) < 0.2 * total
+    assert (np.diff(done) >= 0).all() and done[0] == 0 and done[-1] > 0.7
+    by_time = times[known] / (times + left)[known]
+    assert (done[known] > 0.98 * by_time).all(), "the percentage is not behind the time left"
+    assert np.average(np.abs(done - times / total), weights=weights) < 0.15
+
+
+def test_time_left_is_told_once_it_is_known():
+    now, recorder = [0.0], Recorder()
+    staged = StagedReporter(recorder, lambda: now[0])
+    staged.expect({"a": ("First", 100.0), "b": ("Second", 100.0)})
+
+    def left(seconds, done, **fields):
+        now[0] = seconds
+        staged.progress(done, 100, **fields)
+        return recorder.events[-1]["seconds_left"]
+
     staged.begin("a", "Reading")
-    assert recorder.events[-1] == {"type": "progress", "done": 0.0, "total": 1.0, "seconds_left": 90.0}
-    clock[0] = 20.0
-    staged.progress(1, 2)
-    assert recorder.events[-1]["seconds_left"] == 100.0
-    staged.progress(0, 2)
-    assert recorder.events[-1]["done"] == recorder.events[-2]["done"]
-    staged.expect({"b": ("Second", 60.0)})
+    assert recorder.events[-1] == {"type": "progress", "done": 0.0, "total": 1.0, "seconds_left": None}
+    assert left(1, 0) is None
+    assert left(40, 20) == pytest.approx(360, rel=0.15), "it takes twice as long as expected"
+    assert left(50, 20) == pytest.approx(350, rel=0.15), "the time falls with the clock"
     staged.begin("b", "Working")
-    assert recorder.events[-1]["seconds_left"] == 60.0
-    staged.progress(1, 2, seconds_left=7.0)
-    clock[0] = 30.0
-    staged.progress(5, 2)
-    assert [event["seconds_left"] for event in recorder.events[-2:]] == [7.0, 0.0]
+    assert left(51, 50, seconds_left=7.0) == 7.0
+    assert left(52, 100) == 0.0
     assert recorder.events[-1]["done"] == 0.99
+    assert left(62, 100) == 2.5, "it may not end at once"
+    assert left(112, 100) is None
+
+
+def test_later_parts_of_a_fixed_length_are_not_scaled():
+    now, recorder = [0.0], Recorder()
+    staged = StagedReporter(recorder, lambda: now[0])
+    staged.expect({"a": ("", 50.0), "b": ("", Limit(600.0)), "c": ("", 10.0)})
+    staged.begin("a", "")
+    now[0] = 200.0
+    staged.begin("b", "")
+    assert 620 < recorder.events[-1]["seconds_left"] < 650
+    now[0] = 800.0
+    staged.expect({"c": ("", 100.0)})
+    staged.begin("c", "")
+    assert 300 < recorder.events[-1]["seconds_left"] < 400
+
+
+def test_passes_of_a_part_are_no_steps_backward():
+    now, recorder = [0.0], Recorder()
+    staged = StagedReporter(recorder, lambda: now[0])
+    staged.expect({"a": ("", 20.0), "b": ("", Limit(80.0))})
+    staged.begin("a", "")
+    for tick in range(40):
+        now[0] += 0.5
+        staged.progress(tick % 10, 10)
+        event = recorder.events[-1]
+        assert event["seconds_left"] is None or 80 <= event["seconds_left"] < 110
+        assert event["done"] <= 0.25
 
 
 def test_commands_without_parts_report_as_before():

@@ -238,6 +238,7 @@ def test_other_commands_can_be_paused(monkeypatch):
         later()
         reporter.progress(1, 3)
         assert messages == ["progress 1", "Paused", "Resumed"] and not stop.paused
+        assert 0.1 < stop.paused_seconds < 60
         read.clear()
         requested.set()
         assert read.wait(60)

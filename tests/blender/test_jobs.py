@@ -163,7 +163,7 @@ def test_job_pauses_resumes_and_stops(make):
     job = make(TRAINS)
     queue = started(job)
     until(lambda: job.step, queue.poll)
-    assert (job.progress, job.seconds_left, job.psnr) == (0.25, 30.0, None)
+    assert (job.progress, job.psnr) == (0.25, None) and 0 < job.seconds_left <= 30
     job.pause()
     assert job.state is State.PAUSED and queue.running is job
     until(lambda: job.message == "Paused", queue.poll)
@@ -437,21 +437,34 @@ def test_child_detects_closed_stdin(tmp_path):
     assert not process.send("pause")
 
 
-def test_missing_time_left_is_estimated(make, monkeypatch):
+def test_time_left_falls_with_the_clock(monkeypatch):
     clock = [100.0]
     monkeypatch.setattr(jobs.time, "monotonic", lambda: clock[0])
-    job = Job(title="", kind="train", folder=None, command=[], cwd=Path())
-    job.state, job._began = State.RUNNING, 100.0
-    job._take({"type": "status", "message": "Undistorting"})
-    clock[0] += 10
+    job = Job(title="Train", kind="train", folder=None, command=[], cwd=Path(), state=State.RUNNING)
     job._take({"type": "progress", "done": 1, "total": 4})
-    assert job.seconds_left == pytest.approx(30)
-    clock[0] += 60
-    job._take({"type": "progress", "done": 2, "total": 4, "seconds_left": 7})
-    assert job.seconds_left == pytest.approx(7)
-    clock[0] += 70
-    job._take({"type": "progress", "done": 7, "total": 10})
-    assert job.seconds_left == pytest.approx(60, abs=0.1)
+    assert job.seconds_left is None and job_display.summary(job) == "Train: , 25 %"
+    job._take({"type": "progress", "done": 1, "total": 4, "seconds_left": 120})
+    shown = []
+    for _ in range(5):
+        shown.append(job_display.summary(job).removeprefix("Train: , 25 %, "))
+        clock[0] += 30
+    assert shown == ["2:00 left", "1:30 left", "1:00 left", "less than a minute", "less than a minute"]
+    job._take({"type": "progress", "done": 1, "total": 4, "seconds_left": None})
+    assert job.seconds_left is None
+
+
+def test_panels_are_redrawn_as_the_time_left_falls(monkeypatch):
+    clock, drawn = [100.0], []
+    monkeypatch.setattr(background.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(background, "redraw", lambda: drawn.append(clock[0]))
+    job = Job(title="Train", kind="train", folder=None, command=[], cwd=Path(), state=State.RUNNING)
+    monkeypatch.setattr(background, "queue", JobQueue())
+    background.queue.add(job)
+    job._take({"type": "progress", "done": 1, "total": 4, "seconds_left": 120})
+    while clock[0] < 160:
+        background._tick.__wrapped__()
+        clock[0] += 1
+    assert drawn[0] == 100 and 4 <= len(drawn) <= 6, "for each time that is written, of 2:00 to 1:00 left"
 
 
 def test_time_left_is_steady_but_follows_the_truth(monkeypatch):

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...model.anchors import Anchors
 from ...model.checkpoint import has_checkpoint
+from ...shared.durations import Limit
 from ...shared.errors import InputError
 from ...shared.formats.atomic import make_folder, remove_abandoned
 from ...shared.reconstruction.lock import locked
@@ -33,7 +34,8 @@ _TRAIN = "train"
 def train_cell(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Train a cell in its own folder; nothing else is written, so that others may train other cells."""
     seconds = None if options.minutes is None else 60 * options.minutes
-    reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _TRAIN: ("Training", seconds or 300.0)})
+    expected = Limit(seconds) if seconds else 300.0
+    reporter.expect({READ: ("Preparing", 5.0), KERNELS: ("Preparing", 0.0), _TRAIN: ("Training", expected)})
     number = options.cell
     divided = open_divided(options, reporter, number)
     division, device = divided.division, divided.device

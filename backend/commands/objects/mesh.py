@@ -108,7 +108,7 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         views = Views(model, trained.scene, trained.capture.train_indices, memory_mb=renders)
         for done, target in enumerate(wanted):
             reporter.status(f"Making the mesh of {target.name} ({done + 1} of {len(wanted)})")
-            entry = _make(target, options, trained, views, _Part(reporter, done, len(wanted), started))
+            entry = _make(target, options, trained, views, _Part(reporter, done, len(wanted)))
             if entry.why:
                 reporter.warning(entry.why)
             known = {**_known_meshes(folder), target.key: entry}
@@ -122,10 +122,10 @@ def mesh(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 
 
 class _Part(Reporter):
-    """Converts the progress of a step of a mesh to that of the whole command, with the remaining time."""
+    """Converts the progress of a step of a mesh to that of all meshes."""
 
-    def __init__(self, reporter: StoppingReporter, done: int, total: int, started: float) -> None:
-        self._reporter, self._done, self._total, self._started = reporter, done, total, started
+    def __init__(self, reporter: StoppingReporter, done: int, total: int) -> None:
+        self._reporter, self._done, self._total = reporter, done, total
         self._before, self._fraction, self._shown = 0.0, 0.0, float(done)
 
     def step(self, step: str) -> _Part:
@@ -142,10 +142,7 @@ class _Part(Reporter):
         fraction = self._before + self._fraction * min(done / max(total, 1e-9), 1.0)
         # A step may pass over the views several times, each with a progress from 0.
         self._shown = max(self._shown, self._done + fraction)
-        behind = self._shown / self._total
-        spent = time.monotonic() - self._started
-        left = {"seconds_left": round(spent / behind - spent, 1)} if behind > 0 else {}
-        self._reporter.progress(round(self._shown, 4), self._total, what="meshes", **left)
+        self._reporter.progress(round(self._shown, 4), self._total, what="meshes")
 
 
 def _make(target: Target, options: argparse.Namespace, trained: Trained, views: Views, part: _Part) -> MeshEntry:

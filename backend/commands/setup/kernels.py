@@ -28,16 +28,18 @@ PART = "kernels"
 _SECONDS = 60.0
 """Typical time of a compilation."""
 _PROGRESS_FRACTIONS = {
-    "gaussians": 0.34,
-    "train": 0.36,
-    "discs": 0.12,
-    "match": 0.02,
-    "meshes": 0.1,
-    "fuse": 0.02,
+    "gaussians": 0.3,
+    "train": 0.5,
+    "discs": 0.06,
+    "match": 0.01,
+    "meshes": 0.06,
+    "fuse": 0.03,
     "refine": 0.02,
     "bake": 0.02,
 }
-"""Fractions of its time with helpers, for the progress."""
+"""Fractions of its time with helpers, for the progress, between those of an idle and a busy computer."""
+_FIRST_STEP = 0.65
+"""Fraction of the time of the training until its first step is done, which compiles most."""
 
 
 def kernel_seconds(device: torch.device) -> float:
@@ -76,7 +78,7 @@ def try_kernels(reporter: StoppingReporter, device: torch.device) -> None:
         if helped:
             helpers.begin(MESHES)
         scene = SmallScene(Path(folder) / "scene", device)
-        trainer = scene.train(steps.step("train"), reporter.stop)
+        trainer = scene.train(steps.step("train", _FIRST_STEP), reporter.stop)
         helpers.wait(DISCS, steps.step("discs"))
         compile_kernels(device, steps.progress, ("2d",))
         scene.train_discs()
@@ -91,17 +93,19 @@ class _Steps(Reporter):
     """Converts the progress of a step of the compilation to that of all."""
 
     def __init__(self, reporter: Reporter) -> None:
-        self._reporter, self._before, self._fraction = reporter, 0.0, 0.0
+        self._reporter, self._before, self._fraction, self._first = reporter, 0.0, 0.0, 0.0
 
-    def step(self, step: str) -> _Steps:
-        """Begin a step and return self."""
+    def step(self, step: str, first: float = 0.0) -> _Steps:
+        """Begin a step, of which a fraction is done with its first progress, and return self."""
         self._before += self._fraction
-        self._fraction = _PROGRESS_FRACTIONS[step]
+        self._fraction, self._first = _PROGRESS_FRACTIONS[step], first
         self.progress(0, 1)
         return self
 
     def progress(self, done: float, total: float, **_: Any) -> None:
-        self._reporter.progress(self._before + self._fraction * done / max(total, 1e-9), 1.0)
+        share = done / max(total, 1e-9)
+        share = self._first + (1 - self._first) * share if done else 0.0
+        self._reporter.progress(self._before + self._fraction * share, 1.0)
 
 
 def _are_ready(device: torch.device) -> bool:

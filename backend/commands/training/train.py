@@ -17,6 +17,7 @@ from ...model.checkpoint import has_checkpoint
 from ...planning.agreement import measure_agreement
 from ...planning.decisions import OF_TRAINING, decide, planned_capture, planned_settings
 from ...raster import devices
+from ...shared.durations import Limit
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
 from ...shared.expectation import DEFAULT_SECONDS
@@ -82,7 +83,8 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
             READ: ("Preparing", 5.0), VOTE: ("Preparing", 5.0), "plan": ("Preparing", 5.0),
             DENSE: ("Preparing", 0.0), PLACE: ("Preparing", 0.0), KERNELS: ("Preparing", kernel_seconds(device)),
             PACE: ("Preparing", 0.0),
-            "train": ("Training", budget.seconds or DEFAULT_SECONDS), EXPORT: ("Saving", 5.0),
+            "train": ("Training", Limit(budget.seconds) if budget.seconds else DEFAULT_SECONDS),
+            EXPORT: ("Saving", 5.0),
         }
     )  # fmt: skip
     _check_not_imported(Reconstruction(options.out), options)
