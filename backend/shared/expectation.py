@@ -38,8 +38,9 @@ PSNR_FIT = PsnrFit(-5.17, 0.922, -2.17, 4.88)
 NANOSECONDS_A_PIXEL = (300.0, 1200.0)
 """Minimum and maximum time of a step on a CPU per pixel of a view, used until a training has been measured."""
 
-_SHARPNESS = ((0.15, "very sharp"), (0.6, "sharp"), (1.5, "good"), (3.0, "soft"), (math.inf, "rough"))
-"""Largest deficits in dB and what a training with them looks like."""
+_SHARPNESS = ((0.3, "nearly as sharp as Best"), (1.0, "a little softer than Best"), (math.inf, "softer than Best"))
+"""Largest deficits in dB and what a training with them looks like; Best is what a training until it stops improving is
+called in Blender."""
 
 _LOOKS = ((20.0, "rough"), (24.0, "soft"), (28.0, "good"), (33.0, "sharp"), (math.inf, "very sharp"))
 """PSNR in dB, and what a training below it looks like."""
@@ -115,7 +116,7 @@ def expectation(
         if steps is None:
             length = f" of {_range(f'{_rounded(outlook.fewest):,}', f'{_rounded(outlook.most):,}')} steps{where}"
         elif outlook.slowest:
-            length = f" in {_range(_duration(outlook.fastest), _duration(outlook.slowest))}{where}"
+            length = f" in {_between(outlook.fastest, outlook.slowest)}{where}"
         quality.append(f"{_below_final(outlook)} {_FINAL}")
     return f"Expected{length}: {'; '.join(quality)}" if quality else None
 
@@ -127,22 +128,20 @@ def expectation_in_words(
     trained: tuple[int, float] = (0, 0.0),
     typical: float | None = None,
 ) -> str | None:
-    """Describe the expected duration and sharpness of a training in a few words, such as "about 2 to 8 min: soft".
+    """Describe a training's expected duration and sharpness in a few words, such as "about 2 to 8 min, probably good".
 
-    The arguments are those of `expectation`; None if there is no basis for an estimate.
+    The arguments are those of `expectation`; None if there is no basis for an estimate. What could be one or the other
+    is not told.
     """
-    outlook = _outlook(steps, seconds, pixels, trained)
+    outlook, said = _outlook(steps, seconds, pixels, trained), []
+    if outlook is not None and steps is not None and outlook.slowest:
+        said.append(f"about {_between(outlook.fastest, outlook.slowest)}")
     if typical is not None:
-        bounds = expected_psnr(typical, steps, seconds, pixels, trained)
-        sharpness = f"{_range(*(_word(_LOOKS, bound) for bound in bounds))} ({_in_decibels(bounds)})"
-    elif outlook is not None:
-        ends = shortfall(outlook.fewest)[1], shortfall(outlook.most)[0]
-        sharpness = _range(*(_word(_SHARPNESS, short) for short in ends))
-    else:
-        return None
-    if outlook is None or steps is None or not outlook.slowest:
-        return sharpness
-    return f"about {_range(_duration(outlook.fastest), _duration(outlook.slowest))}: {sharpness}"
+        said.append(f"probably {_word(_LOOKS, sum(expected_psnr(typical, steps, seconds, pixels, trained)) / 2)}")
+    if outlook is not None:
+        found = {_word(_SHARPNESS, sum(shortfall(each)) / 2) for each in (outlook.fewest, outlook.most)}
+        said += found if len(found) == 1 else ()
+    return ", ".join(said) or None
 
 
 def _below_final(outlook: _Outlook) -> str:
@@ -206,7 +205,15 @@ def _rounded(count: float) -> int:
     return int(round(count, 1 - math.floor(math.log10(count)))) if count >= 1 else 1
 
 
+def _between(fastest: float, slowest: float) -> str:
+    """Format two durations in seconds as one or as a range, such as 5 to 20 min."""
+    least, most = _duration(fastest), _duration(slowest)
+    number, unit = least.split()
+    return _range(number if least != most and most.endswith(f" {unit}") else least, most)
+
+
 def _duration(seconds: float) -> str:
     if seconds < 90:
         return f"{round(seconds)} s"
-    return f"{seconds / 60:.0f} min" if seconds >= 600 else f"{seconds / 60:.1f} min"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes >= 3 else f"{round(minutes, 1):g} min"

@@ -26,8 +26,8 @@ def test_shortfall_interpolates_over_log_steps():
 
 
 def test_steps_give_duration_and_quality():
-    assert expected(400, None, 100_000) == (f"Expected in 20 s to 80 s on a CPU: 1.0 to 2.0 dB below {FINAL}")
-    assert expected(1600, None, 100_000) == (f"Expected in 80 s to 5.3 min on a CPU: up to 1.0 dB below {FINAL}")
+    assert expected(400, None, 100_000) == (f"Expected in 20 to 80 s on a CPU: 1.0 to 2.0 dB below {FINAL}")
+    assert expected(1600, None, 100_000) == (f"Expected in 80 s to 5 min on a CPU: up to 1.0 dB below {FINAL}")
 
 
 def test_minutes_give_step_range():
@@ -57,11 +57,22 @@ def test_negligible_loss_is_reported(monkeypatch):
 
 def test_words_tell_duration_and_sharpness():
     words = expectation.expectation_in_words
-    assert words(400, None, 100_000) == "about 20 s to 80 s: soft to good"
-    assert words(1600, None, None) == "good to very sharp"
-    assert words(None, 100.0, 100_000, (200, 50.0)) == "soft to good"
+    assert words(400, None, 100_000) == "about 20 to 80 s, softer than Best"
+    assert words(1600, None, 400_000) == "about 5 to 21 min, a little softer than Best"
+    assert words(1600, None, None) == "a little softer than Best"
+    assert words(None, 400.0, 100_000, (200, 50.0)) == "a little softer than Best"
+    assert words(400, None, 100_000, (200, 50.0)) == "about 1.7 min, softer than Best"
     assert words(None, 60.0, None) is None
-    assert words(10, None, None) == "rough to soft"
+    assert words(None, 120.0, 100_000) is None, "in this time, it gets softer or not"
+
+
+def test_words_tell_lengths_apart(monkeypatch):
+    monkeypatch.undo()
+    words = expectation.expectation_in_words
+    assert words(600, None, 500_000, (0, 0.0), 27.0) == "about 1.5 to 6 min, probably good, softer than Best"
+    assert words(1500, None, 500_000, (0, 0.0), 27.0) == "about 4 to 15 min, probably good, nearly as sharp as Best"
+    assert words(None, 300.0, 500_000, (0, 0.0), 27.0) == "probably good"
+    assert words(None, None, 500_000, (0, 0.0), 27.0) == "probably good"
 
 
 def test_typical_quality_of_the_capture_gives_an_interval(monkeypatch):
@@ -74,4 +85,4 @@ def test_typical_quality_of_the_capture_gives_an_interval(monkeypatch):
     assert expected(400, None, None, (0, 0.0), typical) == f"Expected: {interval}; 1.0 to 2.0 dB below {FINAL}"
     assert expected(None, None, None, (0, 0.0), typical).startswith("Expected: PSNR of 25 to 31 dB")
     words = expectation.expectation_in_words
-    assert words(400, None, 100_000, (0, 0.0), typical) == "about 20 s to 80 s: soft to sharp (24 to 30 dB)"
+    assert words(400, None, 100_000, (0, 0.0), typical) == "about 20 to 80 s, probably good, softer than Best"
