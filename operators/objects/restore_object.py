@@ -6,6 +6,7 @@ from bpy.props import StringProperty
 
 from ...backend.shared.errors import InputError
 from ...objectgs_addon import scene
+from ...objectgs_addon.picking import selection
 from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
@@ -38,7 +39,10 @@ class RestoreObject(bpy.types.Operator):
         item = object_list.item_of(root, int(self.object)) if self.object else object_list.shown_item(root)
         if item is None or not item.removed:
             raise InputError(f"{item.name if item else self.object} is not removed; choose one that is")
-        object_edits.restore(root, [scene.from_stored(item.object_id)])
+        object_id = scene.from_stored(item.object_id)
+        object_edits.restore(root, [object_id])
+        context.view_layer.update()  # Otherwise, the parts do not count as visible yet.
+        selection.select_object(context, root, object_id)
 
 
 CLASSES = (RestoreObject,)

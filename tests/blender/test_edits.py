@@ -339,6 +339,7 @@ def test_object_is_removed_and_restored(root, folder):
     assert collection_of(root) == collection and collection.hide_viewport
     assert bpy.ops.objectgs.restore_object() == {"FINISHED"}
     assert not entry(root).removed and not item(root).removed
+    assert part(root, "object_parent").select_get() and bpy.context.object == part(root, "object_parent")
     assert not collection.hide_viewport and collection.hide_render, "the previous render visibility is restored"
     assert part(root, "object_parent").matrix_basis == where
     assert not bpy.ops.objectgs.restore_object.poll()
@@ -778,6 +779,17 @@ def parts_shown(root) -> list:
     """The pivot, the splats and the mesh of object 1, all visible."""
     blender_scene.show_kinds(root, "both")
     return [part(root, kind) for kind in ("object_parent", "splats", "mesh")]
+
+
+def test_what_is_shown_of_selected_objects_is_selected(root):
+    pivot, splats, mesh = (part(root, kind) for kind in ("object_parent", "splats", "mesh"))
+    blender_scene.show_kinds(root, "splats")
+    choose(pivot, splats)
+    blender_scene.show_kinds(root, "meshes")
+    assert not splats.select_get() and mesh.select_get() and not part(root, "mesh", 2).select_get()
+    choose(part(root, "object_parent", 2))
+    blender_scene.show_kinds(root, "both")
+    assert not splats.select_get() and not mesh.select_get()
 
 
 def choose(*objs) -> None:

@@ -154,7 +154,8 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
 
     An object without a mesh, and what fills the hole of a removed object, always show their splats.
 
-    In addition, users can hide single objects by their collection or with the eye icon.
+    In addition, users can hide single objects by their collection or with the eye icon. What is shown of selected
+    objects is selected.
 
     Args:
         root: the reconstruction's collection.
@@ -163,7 +164,15 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
     if which not in SHOWS:
         raise ValueError(f"{which} cannot be shown")
     root[SHOW] = which
-    apply_shown(root, object_collections(root))
+    collections, copies = object_collections(root), duplicates_of(root)
+    wholes = [parts_of(each) for key in collections for each in (collections[key], *copies.get(key, ()))]
+    selected = [obj for parts in wholes if any(each.select_get() for each in parts) for obj in parts]
+    apply_shown(root, collections)
+    if selected:
+        bpy.context.view_layer.update()  # Otherwise, what was hidden does not count as visible yet.
+    for obj in selected:
+        if obj.visible_get() and not obj.hide_select:
+            obj.select_set(True)
 
 
 def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> None:
