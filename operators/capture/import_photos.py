@@ -81,7 +81,7 @@ class ImportPhotos(ImportDialog, bpy.types.Operator):
         self.layout.prop(self, "features")
         self.layout.prop(self, "frames")
         names = self._names()
-        every = "All in the folder and its subfolders"
+        every = "All photos here and in subfolders"
         self.layout.label(text=f"{len(names)} files" if len(names) > 1 else names[0] if names else every)
 
     @reports_errors
