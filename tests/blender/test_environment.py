@@ -604,6 +604,22 @@ def test_certificates_that_the_system_trusts_are_tried(tmp_path, monkeypatch, ve
     assert (found, used) == ([len(features) == 3] * 2, features)
 
 
+def test_time_left_of_the_setup_goes_over_to_its_pace(monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(events.time, "monotonic", lambda: clock[0])
+    progress = events.Progress({"packages": ("Installing", 60.0), "kernels": ("Compiling", 40.0)})
+    progress.begin("packages", "Resolving")
+    for second in range(1, 31):
+        clock[0] = float(second)
+        progress.at(0.0)
+    for second in range(31, 151):
+        clock[0] = float(second)
+        progress.at((second - 30) / 120)
+    left = [json.loads(line).get("seconds_left") for line in capsys.readouterr().out.splitlines()][1:]
+    assert left[:31] == list(range(100, 69, -1)), "until the pace is known, the usual time is counted down"
+    assert left[90] == pytest.approx(100, rel=0.5) and left[130] == pytest.approx(60, rel=0.1) and left[150] == 40
+
+
 def test_download_of_a_local_version_is_found(root):
     """pip prints its address quoted, and writes a file that is not."""
     shown = []

@@ -63,10 +63,10 @@ class Progress:
         names, seconds = list(self._parts), [usual for _, usual in self._parts.values()]
         place = names.index(self._part)
         before, usual, total, elapsed = sum(seconds[:place]), seconds[place], sum(seconds), now - self._began
-        # Estimate from the typical duration until the pace of the part is known.
-        fraction = self._fraction
-        paced = elapsed * (1 - fraction) / fraction if fraction > 0.05 and elapsed > 3 else None
-        left = usual * (1 - fraction) if paced is None else paced
+        fraction, left = self._fraction, max(usual - elapsed, elapsed / 4)
+        if fraction:
+            # As if a twentieth had been done before in the usual time, so that the pace tells more and more.
+            left = (elapsed + usual / 20) * (1 - fraction) / (fraction + 1 / 20)
         emit(
             "progress",
             done=round(before + usual * fraction, 2),
