@@ -15,7 +15,7 @@ def _modules() -> tuple[ModuleType, ...]:
     from .drawing import camera_errors, point_labels, splat_arrays
     from .film import properties as film
     from .panels import preferences
-    from .running import file_preview, handlers, pointing
+    from .running import file_preview, handlers, pointing, stroke_lines
     from .state import click_selection, properties
 
     return (
@@ -32,6 +32,7 @@ def _modules() -> tuple[ModuleType, ...]:
         drawing,
         camera_errors,
         point_labels,
+        stroke_lines,
         panels,
     )
 

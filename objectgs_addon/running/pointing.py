@@ -49,7 +49,7 @@ class _Session:
         self.proposed_to_replace: dict[str, Any] = {}
         self._asked_strokes: list[dict[str, Any]] = []
         self._asked_everything: bool | None = None
-        self._answered_strokes: list[dict[str, Any]] = []
+        self.answered_strokes: list[dict[str, Any]] = []
         self.taken: tuple[int, int, float] | None = None
         self.wanted_detail: float | None = None
         self.colors: dict[int, tuple[float, ...]] = {}
@@ -70,7 +70,7 @@ class _Session:
         if not content["strokes"]:
             self.objects, self.classes = np.zeros(1, np.int64), np.zeros(len(self.keys), np.int64)
             self.asked = self.answered = self.asked + 1
-            self._answered_strokes = []
+            self.answered_strokes = []
             return
         self.asked += 1
         self.process.send(json.dumps({"request": self.asked, **content}), replaces=True)
@@ -137,15 +137,15 @@ class _Session:
                 raise ValueError("its objects are not those of the splats")
             self.taken = self._most_taken(objects[classes])
             self.objects, self.classes, self.answered = objects, classes, self.asked
-            self._answered_strokes = self._asked_strokes
+            self.answered_strokes = self._asked_strokes
 
     def _most_taken(self, owners: np.ndarray) -> tuple[int, int, float] | None:
         """Return what the newest strokes have taken most of: who took, from which object, and which share of it.
 
         owners: (N,) IDs of the objects to which the splats belong now. None if nothing noticeable was taken.
         """
-        known = len(self._answered_strokes)
-        if self._asked_strokes[:known] != self._answered_strokes:
+        known = len(self.answered_strokes)
+        if self._asked_strokes[:known] != self.answered_strokes:
             return None
         drawn = {stroke["object"] for stroke in self._asked_strokes[known:]} - {marks.NOTHING}
         before = self.objects[self.classes]
@@ -282,12 +282,12 @@ def message() -> str:
     return "" if _session is None else _session.message
 
 
-def share_of_splats() -> dict[int, int]:
-    """Return the number of splats of each marked object."""
-    if _session is None:
-        return {}
-    counts = np.bincount(_session.classes, minlength=len(_session.objects))
-    return dict(zip(_session.objects.tolist(), counts.tolist()))
+def waiting_strokes(root: bpy.types.Collection) -> list[dict[str, Any]]:
+    """Return the strokes on a reconstruction that are not answered yet, but will be."""
+    session = _session if is_active(root) else None
+    if session is None or session.will_propose() or (session.ready and session.asked == session.answered):
+        return []
+    return [stroke for stroke in marks.strokes_of(root) if stroke not in session.answered_strokes]
 
 
 def refresh(root: bpy.types.Collection) -> None:

@@ -7,16 +7,13 @@ import math
 from typing import Any
 
 import bpy
-import gpu
 from bpy.props import CollectionProperty
-from gpu_extras.batch import batch_for_shader
 
+from ...objectgs_addon.running.stroke_lines import draw_line
 from .viewport import InViewport
 
 _SPACING = 2.0
 """Smallest distance in pixels of the positions of a path."""
-_LINES = (((0.0, 0.0, 0.0, 0.8), 4.0), ((1.0, 1.0, 1.0, 1.0), 2.0))
-"""Color and width in pixels, at a UI scale of 1, of a line's outline and of the line, in the order of drawing."""
 
 Points = list[tuple[float, float]]
 
@@ -86,20 +83,6 @@ class FollowsMouse(InViewport):
     def _draw(self) -> None:
         if bpy.context.region == self._region:
             draw_line(self.outline([tuple(item.loc) for item in self.path]))
-
-
-def draw_line(points: Points) -> None:
-    """Draw a white line with a dark outline, which is seen on any background; points: pixels from the lower left."""
-    shader = gpu.shader.from_builtin("POLYLINE_UNIFORM_COLOR")
-    batch = batch_for_shader(shader, "LINE_STRIP", {"pos": [(x, y, 0.0) for x, y in points]})
-    scale = bpy.context.preferences.system.ui_scale
-    gpu.state.blend_set("ALPHA")
-    shader.uniform_float("viewportSize", gpu.state.viewport_get()[2:])
-    for color, width in _LINES:
-        shader.uniform_float("color", color)
-        shader.uniform_float("lineWidth", width * scale)
-        batch.draw(shader)
-    gpu.state.blend_set("NONE")
 
 
 def rectangle(points: Points) -> Points:

@@ -24,11 +24,11 @@ from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.panels.objects import MarkingPanel
 from objectgs.objectgs_addon.picking import marks
 from objectgs.objectgs_addon.process.jobs import State
-from objectgs.objectgs_addon.running import background, pointing
+from objectgs.objectgs_addon.running import background, pointing, stroke_lines
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import can_mark
-from objectgs.operators.common import jobs, need, path
+from objectgs.operators.common import jobs, need
 from objectgs.operators.marking import clean_labels, marked_objects
 
 import headless
@@ -328,9 +328,9 @@ def test_answers_are_shown_and_end_with_the_strokes(root, session):
     marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
     assert session.process.sent[-1]["request"] == session.asked == 1
     answer(session, [3], [0] * count)
-    assert pointing.share_of_splats() == {3: count} and pointing.state() == (1.0, False)
+    assert session.objects[session.classes].tolist() == [3] * count and pointing.state() == (1.0, False)
     marks.clear(root)
-    assert pointing.share_of_splats() == {0: count} and not pointing.state()[1]
+    assert not session.objects[session.classes].any() and not pointing.state()[1]
 
 
 @pytest.mark.parametrize("state", [State.DONE, State.STOPPED, State.FAILED])
@@ -394,12 +394,52 @@ def test_one_list_of_objects_is_open(root, session):
     assert "OBJECTGS_UL_marked" in texts_of(MarkingPanel)
 
 
+def lines_of(root) -> list:
+    return stroke_lines.lines(root, bpy.context.view_layer, None)
+
+
+def test_lines_of_strokes_stay_until_the_strokes_are_answered(root, session):
+    """From any side, they are on what they were drawn over, in the color of their object."""
+    item = marks.add_object(root)
+    at = world_of(root)
+    for view in views(root):
+        middle = pixel(view, at)
+        drawn = [tuple(middle + np.array(off)) for off in ((-60, 5), (0, 0), (30, -9))]
+        marks.add_stroke(root, item.object_id, view, drawn, area=False)
+        points, color = lines_of(root)[-1]
+        assert np.allclose([pixel(view, point) for point in points], drawn, atol=0.2)
+        assert np.linalg.norm(points - at, axis=1).max() < 4 and np.allclose(color, item.color)
+    marks.add_stroke(root, marks.NOTHING, views(root)[0], [tuple(middle)] * 2, area=False)
+    points, color = lines_of(root)[-1]
+    assert np.ptp(points, axis=0).max() > 0 and color == (1.0, 1.0, 1.0), "a click"
+    marks.add_stroke(root, 1, views(root)[0], [(1, 1), (9, 1), (9, 9)], area=True)
+    points = lines_of(root)[-1][0]
+    assert len(lines_of(root)) == 4 and np.array_equal(points[0], points[-1])
+    session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
+    session.ask(marks.content(root))
+    assert len(lines_of(root)) == 4
+    answer(session, [item.object_id], [0] * len(session.keys))
+    assert not lines_of(root)
+    marks.add_stroke(root, 2, views(root)[0], [(5, 5), (9, 5)], area=False)
+    assert len(lines_of(root)) == 1
+    session.take({"type": "answer", "request": session.asked, "problem": "Stroke 5 shows no splats", "stroke": 5})
+    assert not lines_of(root)
+
+
+def test_no_line_is_drawn_of_strokes_that_are_replaced_or_have_no_camera(root, session):
+    marks.add_stroke(root, 1, views(root)[0], [(1, 1), (9, 1)], area=False)
+    pointing.propose(root)
+    assert not lines_of(root)
+    marks.set_proposed(root, PROPOSED)
+    assert len(pointing.waiting_strokes(root)) == 4 and not lines_of(root)
+
+
 def test_panel_asks_for_the_surroundings_of_a_single_object(root, session):
     view = views(root)[0]
     session.take({"type": "status", "message": "Comparing the splats"})
     assert "Comparing the splats" in texts_of(MarkingPanel)
     marks.add_stroke(root, 1, view, [(1, 1), (9, 1)], area=False)
-    assert "Strokes so far are applied when this is done." in texts_of(MarkingPanel)
+    assert "Strokes so far are applied when this is done. Press Tab for the next object." in texts_of(MarkingPanel)
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     answer(session, [1], [0] * len(session.keys))
     assert "mark what it stands on, too" in texts_of(MarkingPanel)
@@ -605,7 +645,7 @@ def test_answers_to_earlier_strokes_are_ignored(root, session):
     for _ in range(2):
         marks.add_stroke(root, 3, views(root)[0], [(1, 1)], area=False)
     answer(session, [3], [0] * len(session.keys), request=1)
-    assert pointing.state()[1] and pointing.share_of_splats() == {0: len(session.keys)}
+    assert pointing.state()[1] and not session.objects[session.classes].any()
     assert session.take({"type": "answer", "request": 2, "problem": "Stroke 2 shows no splats", "stroke": 2}) == 2
 
 
@@ -693,11 +733,11 @@ def test_lines_of_strokes_have_a_dark_outline(monkeypatch):
     batch = SimpleNamespace(draw=lambda _shader: drawn.append((sum(now["color"][:3]), now["lineWidth"])))
     state = SimpleNamespace(blend_set=lambda _mode: None, viewport_get=lambda: (0, 0, 80, 60))
     made = SimpleNamespace(from_builtin=lambda _name: shader)
-    monkeypatch.setattr(path, "gpu", SimpleNamespace(shader=made, state=state))
-    monkeypatch.setattr(path, "batch_for_shader", lambda *_: batch)
+    monkeypatch.setattr(stroke_lines, "gpu", SimpleNamespace(shader=made, state=state))
+    monkeypatch.setattr(stroke_lines, "batch_for_shader", lambda *_: batch)
     system = SimpleNamespace(system=SimpleNamespace(ui_scale=2.0))
-    monkeypatch.setattr(path, "bpy", SimpleNamespace(context=SimpleNamespace(preferences=system)))
-    path.draw_line([(1, 2), (30, 40)])
+    monkeypatch.setattr(stroke_lines, "bpy", SimpleNamespace(context=SimpleNamespace(preferences=system)))
+    stroke_lines.draw_line([(1, 2), (30, 40)])
     (outline, wide), (line, narrow) = drawn
     assert outline == 0 and line == 3 and wide > narrow + 2 and now["viewportSize"] == (80, 60)
 

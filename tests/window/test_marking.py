@@ -67,8 +67,12 @@ def settled(window) -> dict[int, int]:
     while asked(window, "pointing.state() != (1.0, False)"):
         assert time.monotonic() < deadline, "the strokes are not answered"
         time.sleep(0.3)
-    found = asked(window, "{str(i): n for i, n in pointing.share_of_splats().items()}")
-    return {int(i): n for i, n in found.items()}
+    objects, counts = asked(
+        window,
+        "[pointing._session.objects.tolist(), __import__('numpy').bincount(pointing._session.classes, "
+        "minlength=len(pointing._session.objects)).tolist()]",
+    )
+    return dict(zip(objects, counts, strict=True))
 
 
 def at(window, center) -> tuple[float, float]:

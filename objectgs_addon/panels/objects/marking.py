@@ -14,7 +14,7 @@ from ...state import folder_trust
 from ...state.next_step import can_mark
 from ..tab import WithReconstruction, draw_job_of
 
-_ROWS = 3
+_ROWS = 4
 """Rows of the state of the marking, whatever it says."""
 
 
@@ -99,8 +99,8 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         progress, waits = pointing.state()
         if progress < 1.0:
             layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
-            has_strokes = bool(marks.strokes_of(root))
-            text = "Strokes so far are applied when this is done." if has_strokes else pointing.message()
+            waiting = "Strokes so far are applied when this is done. Press Tab for the next object."
+            text = waiting if pointing.waiting_strokes(root) else pointing.message()
             write(layout, text, rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
