@@ -267,7 +267,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
         warnings = scene.warnings_of(root)
         if files.splats.exists():
             warnings += scene.show_result(root, folder).warnings
-            view.hide_points(root)
+            view.hide_capture(root)
         scene.set_up_render(target, root)
         view.hide_relationship_lines()
         has_meshes = bool(scene.object_meshes(root))

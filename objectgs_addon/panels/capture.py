@@ -13,7 +13,7 @@ from ..environment import locations
 from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import write
-from ..state import folder_trust
+from ..state import folder_trust, visibility
 from ..state.folder_state import folder_state
 from ..state.next_step import IMPORT, RESUME, Step, find_step, is_capture_gone, next_step
 from .preferences import draw_online_access
@@ -73,7 +73,7 @@ class CapturePanel(Tab, bpy.types.Panel):
             column.operator("objectgs.import_splats", icon="POINTCLOUD_DATA")
             column.operator("objectgs.make_demo", icon="MESH_MONKEY")
         else:
-            _draw_display(layout, context.scene.objectgs)
+            _draw_display(layout, context, active)
 
 
 def _others(owner: bpy.types.Scene) -> bool:
@@ -183,15 +183,21 @@ def _draw_button(layout: bpy.types.UILayout, step: Step) -> None:
         setattr(operator, name, value)
 
 
-def _draw_display(layout: bpy.types.UILayout, properties: bpy.types.PropertyGroup) -> None:
-    """Draw how points and splats are displayed."""
+def _draw_display(layout: bpy.types.UILayout, context: bpy.types.Context, root: bpy.types.Collection) -> None:
+    """Draw how points and splats are displayed and, where splats have replaced the points, whether cameras are."""
     failure = drawing.failure()
     if failure is not None:
         write(layout, failure, "ERROR")
     row = layout.row(align=True)
-    row.prop(properties, "colors", expand=True)
+    row.prop(context.scene.objectgs, "colors", expand=True)
     row.separator()
-    row.prop(properties, "draw_splats", text="", icon="SHADING_RENDERED")
+    row.prop(context.scene.objectgs, "draw_splats", text="", icon="SHADING_RENDERED")
+    layer = visibility.capture_layer(context.view_layer, root) if scene.object_collections(root) else None
+    if layer is not None and any(obj.type == "CAMERA" for obj in layer.collection.objects):
+        row = layout.row()
+        row.alignment = "LEFT"
+        icon = "HIDE_ON" if layer.hide_viewport else "HIDE_OFF"
+        row.prop(layer, "hide_viewport", text="Cameras", icon=icon, emboss=False)
 
 
 def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:

@@ -124,7 +124,7 @@ def _show_result(job: Job, owner: bpy.types.Scene | None) -> bool:
     roots = _shown_roots(job, owner)
     for root in roots:
         if not scene.object_collections(root):
-            view.hide_points(root)
+            view.hide_capture(root)
             _set_colors(root, "photo")
         shown = scene.show_result(root, _folder_of(job))
         job.warnings.extend(shown.warnings)

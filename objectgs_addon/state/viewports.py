@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from .. import drawing, scene
+from . import object_list, visibility
 
 
 def show(root: bpy.types.Collection) -> None:
@@ -19,7 +20,8 @@ def show(root: bpy.types.Collection) -> None:
             continue
         window.view_layer.update()
         cameras = sorted(
-            (part for part in root.all_objects if scene.kind_of(part) == "camera"), key=lambda camera: camera.name
+            (part for part in root.all_objects if scene.kind_of(part) == "camera" and part.data is not None),
+            key=lambda camera: camera.name,
         )
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
@@ -28,11 +30,15 @@ def show(root: bpy.types.Collection) -> None:
                     _look_as(area.spaces.active, cameras)
 
 
-def hide_points(root: bpy.types.Collection) -> None:
-    """Hide the point cloud when splats or meshes replace it, in every view layer and in instances."""
+def hide_capture(root: bpy.types.Collection) -> None:
+    """Hide the capture when splats or meshes replace it: its points also in instances, its cameras in view layers."""
     points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
     for part in points:  # Hiding frees the list of the collection's objects.
         part.hide_viewport = True
+    for owner in object_list.scenes_of(root):
+        for view_layer in owner.view_layers:
+            if (layer := visibility.capture_layer(view_layer, root)) is not None:
+                layer.hide_viewport = True
 
 
 def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:
@@ -71,7 +77,7 @@ def subject_of(centers: np.ndarray, axes: np.ndarray) -> np.ndarray:
 
 
 def _look_as(space: bpy.types.SpaceView3D, cameras: list[bpy.types.Object]) -> None:
-    """Look from where the first camera is, and turn around what the cameras look at.
+    """Look from just before the first camera, whose drawing would fill the view, and turn around what all look at.
 
     From outside, the walls of a captured room would hide it.
     """
@@ -82,11 +88,13 @@ def _look_as(space: bpy.types.SpaceView3D, cameras: list[bpy.types.Object]) -> N
     spread = float(np.linalg.norm(np.ptp(centers, axis=0)))
     if not 0.1 * spread < far < 2.0 * spread:  # Cameras that look outward, or in parallel.
         far = spread or 1.0
+    drawn = cameras[0].data
+    before = min(1.5 * drawn.display_size * drawn.lens / drawn.sensor_width, 0.5 * far)
     region = space.region_3d
     region.view_perspective = "PERSP"
     region.view_rotation = cameras[0].matrix_world.to_quaternion()
     region.view_location = centers[0] + far * axes[0]
-    region.view_distance = far
+    region.view_distance = far - before
 
 
 def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:

@@ -17,15 +17,26 @@ def _layers(layer: bpy.types.LayerCollection) -> Iterator[bpy.types.LayerCollect
         yield from _layers(child)
 
 
+def _layers_of(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> Iterator[bpy.types.LayerCollection]:
+    """Yield the layer collections of a reconstruction; none if it is not in the view layer."""
+    top = next((layer for layer in _layers(view_layer.layer_collection) if layer.collection == root), None)
+    return _layers(top) if top is not None else iter(())
+
+
 def object_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> dict[int, bpy.types.LayerCollection]:
     """Map object IDs to layer collections, for objects that have one."""
-    top = next((layer for layer in _layers(view_layer.layer_collection) if layer.collection == root), None)
     return {
         object_id: layer
-        for layer in (_layers(top) if top is not None else ())
+        for layer in _layers_of(view_layer, root)
         if scene.kind_of(layer.collection) == "object"
         and (object_id := scene.object_id_of(layer.collection)) is not None
     }
+
+
+def capture_layer(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> bpy.types.LayerCollection | None:
+    """Return the layer collection of a reconstruction's cameras and points, if the view layer has it."""
+    layers = _layers_of(view_layer, root)
+    return next((layer for layer in layers if scene.kind_of(layer.collection) == "capture"), None)
 
 
 def _duplicate_layers(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> list[bpy.types.LayerCollection]:

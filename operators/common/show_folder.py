@@ -35,7 +35,7 @@ def show_folder(operator: bpy.types.Operator, context: bpy.types.Context, folder
     try:
         if Reconstruction(folder).splats.exists():
             if not scene.object_collections(root):
-                view.hide_points(root)
+                view.hide_capture(root)
             shown = scene.show_result(root, folder)
             for sentence in shown.warnings:
                 operator.report({"WARNING"}, sentence)

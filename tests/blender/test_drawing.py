@@ -8,6 +8,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from mathutils import Vector
 from objectgs.backend.shared.color.recolor import Recolor
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.drawing import gather, splat_arrays, viewport
@@ -247,3 +248,17 @@ def test_view_looks_at_subject_of_cameras():
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     assert np.allclose(viewports.subject_of(centers, axes), subject, atol=5e-3)
     assert np.isfinite(viewports.subject_of(centers, np.tile([0.0, 1.0, 0.0], (20, 1)))).all()
+
+
+def test_view_begins_before_the_drawing_of_the_first_camera(root):
+    """From inside of the camera, its frame would fill the view."""
+    viewports.show(root)
+    spaces = [area.spaces.active for area in bpy.context.window.screen.areas if area.type == "VIEW_3D"]
+    region = spaces[0].region_3d
+    camera = min((obj for obj in root.all_objects if scene.kind_of(obj) == "camera"), key=lambda obj: obj.name)
+    eye = region.view_location + region.view_rotation @ Vector((0.0, 0.0, region.view_distance))
+    ahead = camera.matrix_world.inverted() @ eye
+    frame = np.array(camera.data.view_frame(scene=bpy.context.scene))
+    depth = camera.data.display_size * -frame[0, 2] / np.ptp(frame[:, 0])
+    assert depth < -ahead.z < 0.5 * camera.matrix_world.translation.length and np.allclose(ahead.xy, 0.0, atol=1e-5)
+    assert np.allclose(camera.matrix_world.inverted() @ region.view_location, (0.0, 0.0, -(10.0**0.5)), atol=0.1)

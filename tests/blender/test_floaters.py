@@ -11,13 +11,16 @@ from objectgs.backend.shared.reconstruction.objects import edit_objects, read_ob
 from objectgs.backend.shared.splats.floaters import floating, near_sphere
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
+from objectgs.objectgs_addon.panels.capture import CapturePanel
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.edits import floaters
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
+from objectgs.objectgs_addon.state import visibility
 
 import headless
 
 from .building import splat_table, write_folder, write_points
+from .drawn import texts_of
 
 STRAYS = np.array([(40.0, 0, 0), (0, -30.0, 0), (0, 0, 79.0)])
 ORIGIN = np.array([100.0, -200.0, 30.0])
@@ -199,6 +202,20 @@ def test_capture_comes_after_objects(root):
     assert capture.name not in bpy.context.scene.collection.children and len(bpy.data.collections) == 4
     blender_scene.show_result(root, blender_scene.folder_of(root))
     assert json.loads(root["objectgs_grouping"]) == {} and root.children[-1] == capture
+
+
+def test_cameras_are_hidden_when_splats_replace_the_capture(root):
+    """They would be in the way of strokes; the first panel shows them again."""
+    layer = visibility.capture_layer(bpy.context.view_layer, root)
+    cameras = [obj for obj in layer.collection.objects if obj.type == "CAMERA"]
+    assert layer.hide_viewport and cameras and not any(obj.visible_get() or obj.hide_viewport for obj in cameras)
+    assert "hide_viewport Cameras" in texts_of(CapturePanel)
+    layer.hide_viewport = False
+    blender_scene.show_result(root, blender_scene.folder_of(root))
+    assert all(obj.visible_get() for obj in cameras), "what the user shows stays"
+    for obj in cameras:
+        bpy.data.objects.remove(obj)
+    assert "hide_viewport Cameras" not in texts_of(CapturePanel)
 
 
 def test_order_of_the_user_is_kept(root):
