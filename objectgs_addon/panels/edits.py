@@ -30,9 +30,12 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         if item is None:
             write(layout, "There are no objects yet.", "INFO")
             return
-        collection = scene.object_collections(root).get(scene.from_stored(item.object_id))
+        object_id = scene.from_stored(item.object_id)
+        collection = scene.object_collections(root).get(object_id)
+        duplicate = selection.active_duplicate(context, root, object_id)
+        name = item.name if duplicate is None else f"{duplicate.name} (duplicate of {item.name})"
         several = [] if item.removed else selection.selected_collections(context, root)[1:]
-        heading = f"{len(several) + 1} selected objects" if several else item.name
+        heading = f"{len(several) + 1} selected objects" if several else name
         layout.label(text=heading, icon="TRASH" if item.removed else "OUTLINER_COLLECTION")
         if item.removed:
             row = layout.row(align=True)
@@ -58,11 +61,12 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
             write(layout, "This object has no splats and no mesh yet; train first.", "INFO")
             return
         if several:
-            layout.label(text=item.name, icon="OUTLINER_COLLECTION")
+            layout.label(text=name, icon="OUTLINER_COLLECTION")
+        count = len(scene.duplicates_of(root).get(object_id, []))
+        if count:
+            write(layout, f"Colors of {item.name} and its {f'{count} duplicates' if count > 1 else 'duplicate'}")
         self._draw_colors(layout, item)
-        copies = scene.duplicates_of(root).get(scene.from_stored(item.object_id), [])
-        active = context.active_object
-        self._draw_transform(layout, root, collection, copies, active if active in context.selected_objects else None)
+        self._draw_transform(layout, root, duplicate or collection)
         if not item.removed and (item.fill or scene.is_moved(root, collection)):
             self._draw_fill(layout, layout.row(), root, item, collection)
 
@@ -104,24 +108,16 @@ class EditPanel(WithReconstruction, bpy.types.Panel):
         row.operator("objectgs.reset_object", text="Reset Colors", icon="LOOP_BACK").what = "COLORS"
 
     def _draw_transform(
-        self,
-        layout: bpy.types.UILayout,
-        root: bpy.types.Collection,
-        collection: bpy.types.Collection,
-        copies: list[bpy.types.Collection],
-        active: bpy.types.Object | None,
+        self, layout: bpy.types.UILayout, root: bpy.types.Collection, collection: bpy.types.Collection
     ) -> None:
-        """Draw where an object is, or the one of its duplicates to which the active object belongs."""
-        chosen = next((copy for copy in copies if active is not None and active in set(copy.objects)), collection)
-        place = scene.placement_of(root, chosen)
+        """Draw where an object or duplicate is."""
+        place = scene.placement_of(root, collection)
         column = layout.column(align=True)
-        moved = scene.is_moved(root, chosen)
-        where = _describe_transform(root, chosen, place) if place is not None and moved else "Not moved"
-        column.label(text=where if chosen == collection else f"Duplicate: {where.lower()}", icon="OBJECT_ORIGIN")
-        if copies:
-            column.label(text=f"{len(copies)} duplicate{'s' if len(copies) > 1 else ''}", icon="DUPLICATE")
+        moved = scene.is_moved(root, collection)
+        where = _describe_transform(root, collection, place) if place is not None and moved else "Not moved"
+        column.label(text=where, icon="OBJECT_ORIGIN")
         row = column.row()
-        row.enabled = moved and chosen == collection
+        row.enabled = moved
         row.operator("objectgs.reset_object", text="Reset Transform", icon="LOOP_BACK").what = "TRANSFORM"
 
 

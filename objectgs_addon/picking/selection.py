@@ -77,5 +77,16 @@ def selected_collections(context: bpy.types.Context, root: bpy.types.Collection)
     return list(dict.fromkeys(collection for collection in found if collection is not None))
 
 
+def active_duplicate(
+    context: bpy.types.Context, root: bpy.types.Collection, object_id: int
+) -> bpy.types.Collection | None:
+    """Return the collection of an object's duplicate that the active object is of, if it is selected; or None."""
+    active = context.active_object
+    if active is None or active not in context.selected_objects:
+        return None
+    copies = scene.duplicates_of(root).get(object_id, [])
+    return next((copy for copy in copies if active in set(copy.objects)), None)
+
+
 def selectable(part: bpy.types.Object) -> bool:
     return part.visible_get() and not part.hide_select

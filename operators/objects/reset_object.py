@@ -5,6 +5,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ...objectgs_addon import scene
+from ...objectgs_addon.picking import selection
 from ...objectgs_addon.state import object_edits, object_list
 from ..common import need
 from ..common.reporting import reports_errors
@@ -28,7 +29,7 @@ class ResetObject(bpy.types.Operator):
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         return {
             "COLORS": "Reset the colors of the active object to those of the capture",
-            "TRANSFORM": "Move the active object back to where it was captured",
+            "TRANSFORM": "Move the active object or duplicate back to where it was captured",
         }[properties.what]
 
     @classmethod
@@ -44,9 +45,10 @@ class ResetObject(bpy.types.Operator):
             object_edits.reset_colors(root, [object_id])
         else:
             object_edits.store_edits(root)  # Earlier changes have an undo step of their own.
-            scene.reset_placement(root, scene.object_collections(root)[object_id])
+            duplicate = selection.active_duplicate(context, root, object_id)
+            scene.reset_placement(root, duplicate or scene.object_collections(root)[object_id])
             object_edits.store_edits(root)
-            if item.fill and not item.removed:
+            if duplicate is None and item.fill and not item.removed:
                 object_edits.fill_hole(root, object_id, False)
 
 

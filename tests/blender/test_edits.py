@@ -579,6 +579,27 @@ def test_duplicate_shares_data_and_is_stored(root, folder):
     assert entry(root).copies == () and not entry(root).removed and not blender_scene.duplicates_of(root)
 
 
+def test_panel_is_about_the_selected_duplicate(root):
+    activate(root, 1)
+    name = item(root).name
+    assert "duplicate of" not in texts_of(EditPanel) and "Colors of" not in texts_of(EditPanel)
+    bpy.ops.objectgs.duplicate_object()
+    (copy,) = blender_scene.duplicates_of(root)[1]
+    part(root, "object_parent").location.y += 1.0
+    drawn = texts_of(EditPanel)
+    assert f"{copy.name} (duplicate of {name})" in drawn and "Not moved" in drawn
+    assert f"Colors of {name} and its duplicate" in drawn
+    kinds.part_of(copy, "object_parent").location.x += 4.0
+    assert "Moved by 4" in texts_of(EditPanel)
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert entry(root).copies == (tuple(tuple(row) for row in np.eye(4).tolist()),)
+    assert entry(root).transform is not None, "the original stays where it is"
+    selection.select_collections(bpy.context, [collection_of(root)])
+    assert "Moved by 1" in texts_of(EditPanel) and "duplicate of" not in texts_of(EditPanel)
+    bpy.ops.objectgs.reset_object(what="TRANSFORM")
+    assert entry(root).transform is None
+
+
 def test_a_duplicate_that_the_user_moved_out_stays_stored(root):
     activate(root, 1)
     bpy.ops.objectgs.duplicate_object()
