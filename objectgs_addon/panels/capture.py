@@ -166,12 +166,13 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     _draw_button(button, step)
     if jobs:
         _draw_jobs(column, jobs)
-    # Other operators tell themselves why they have to wait; imports can be started elsewhere meanwhile.
-    is_import_waiting = must_wait and step == IMPORT
-    if is_import_waiting or not jobs:
+    # Most operators tell themselves why they have to wait.
+    is_unexplained = must_wait and getattr(bpy.ops.objectgs, step.operator.split(".")[1]).poll()
+    if is_unexplained or not jobs:
         text = column.column()
         text.active = False
-        write(text, "To import something else, wait for this job or stop it." if is_import_waiting else step.purpose)
+        waiting = "To import something else" if step == IMPORT else f"For {step.label}"
+        write(text, f"{waiting}, wait for this job or stop it." if is_unexplained else step.purpose)
     if step.operator == "objectgs.set_up_backend":
         opens = column.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES")
         opens.module = locations.PACKAGE

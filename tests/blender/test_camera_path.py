@@ -12,6 +12,7 @@ bpy = pytest.importorskip("bpy")
 
 from objectgs.objectgs_addon import scene
 from objectgs.objectgs_addon.film.camera_path import path_order
+from objectgs.objectgs_addon.panels.capture import CapturePanel
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background
 from objectgs.objectgs_addon.scene import kinds
@@ -22,6 +23,7 @@ from objectgs.objectgs_addon.state.next_step import next_step
 import headless
 
 from .building import look_at, write_cameras, write_folder
+from .drawn import texts_of
 
 
 @pytest.fixture
@@ -105,6 +107,20 @@ def test_next_step_follows_the_state(root, monkeypatch):
     assert next_step(root, owner).operator == "objectgs.set_up_render"
     bpy.ops.objectgs.set_up_render()
     assert next_step(root, owner).operator == "objectgs.film_frames"
+
+
+def test_next_step_that_waits_for_a_job_says_so(root, tmp_path, monkeypatch):
+    """Either its tooltip does, where the operator refuses, or the panel."""
+    monkeypatch.setenv("OBJECTGS_PYTHON", sys.executable)
+    told = "wait for this job or stop it"
+    assert told not in texts_of(CapturePanel)
+    monkeypatch.setattr(background.queue, "jobs", [Job("Job", "mesh", scene.folder_of(root), ["true"], tmp_path)])
+    assert f"For Clean Floaters, {told}." in texts_of(CapturePanel)
+    bpy.ops.objectgs.clean_floaters(everything=True)
+    bpy.ops.objectgs.set_up_render()
+    assert next_step(root, bpy.context.scene).operator == "objectgs.film_frames" and told not in texts_of(CapturePanel)
+    with pytest.raises(RuntimeError, match="A job is using"):
+        bpy.ops.objectgs.film_frames()
 
 
 def test_next_step_of_a_training_whose_capture_has_changed(root, tmp_path, monkeypatch):
