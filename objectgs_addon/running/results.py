@@ -24,6 +24,9 @@ from ..state import viewports as view
 from ..state.folder_state import folder_state, reconstruction_for
 from .wording import in_blender
 
+_LEFT_OVER = 0.01
+"""Share of the splats from which on it is told that they belong to no marked object."""
+
 
 def _folder_of(job: Job) -> Path:
     """Return the folder of a job whose result can be shown."""
@@ -136,7 +139,24 @@ def _show_labels(job: Job, owner: bpy.types.Scene | None) -> bool:
     """Show the objects that strokes have separated, each in a collection of its own."""
     for root in _shown_roots(job, owner):
         scene.show_objects(root, _folder_of(job))
-    return _show_result(job, owner)
+    is_shown = _show_result(job, owner)
+    roots = _shown_roots(job, owner)
+    if roots and "--strokes" in job.command:
+        _tell_unmarked(job, roots[0])
+    return is_shown
+
+
+def _tell_unmarked(job: Job, root: bpy.types.Collection) -> None:
+    """Say how many splats belong to no marked object, such as a ring between two; a larger rest is meant to be one."""
+    counts = object_list.splat_counts(root)
+    share = counts.get(marks.NOTHING, 0) / max(sum(counts.values()), 1)
+    if _LEFT_OVER < share < 0.5:
+        messages.show(
+            f"{job.title}: {100 * share:.0f} % of the splats belong to no object and stay background. If they should "
+            "not, draw over them, too, or check Everything Is Marked, and separate again.",
+            operator="objectgs.start_marking",
+            label="Mark Objects",
+        )
 
 
 def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:

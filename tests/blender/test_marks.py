@@ -24,7 +24,7 @@ from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.panels.objects import MarkingPanel
 from objectgs.objectgs_addon.picking import marks
 from objectgs.objectgs_addon.process.jobs import State
-from objectgs.objectgs_addon.running import background, pointing, stroke_lines
+from objectgs.objectgs_addon.running import background, pointing, results, stroke_lines
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.state.folder_state import UNKNOWN
 from objectgs.objectgs_addon.state.next_step import can_mark
@@ -355,6 +355,22 @@ def test_marks_stay_in_the_viewport_while_their_objects_are_separated(root, sess
     background._handle_end(job)
     background._results.clear()
     assert not are_colored()
+
+
+def test_splats_that_no_stroke_has_marked_are_told_after_the_separation(root, monkeypatch):
+    told = []
+    monkeypatch.setattr(messages, "show", lambda text, **options: told.append((text, options["operator"])))
+    job = locations.backend_job("Separate objects of table", "label", blender_scene.folder_of(root), "label")
+    show = results.SHOW_BY_KIND["label"]
+    assert show(job, bpy.context.scene) and not told, "corrected masks"
+    job.command += ["--strokes", "strokes.json"]
+    show(job, bpy.context.scene)
+    assert "Separate objects of table: 25 % of the splats belong to no object" in told[0][0]
+    assert told[0][1] == "objectgs.start_marking"
+    for counts in ({0: 1, 1: 199}, {0: 120, 1: 80}):
+        monkeypatch.setattr(results.object_list, "splat_counts", lambda _, counts=counts: counts)
+        show(job, bpy.context.scene)
+    assert len(told) == 1, "hardly any, or the surroundings"
 
 
 @pytest.mark.parametrize(("kind", "goes_on"), [("export", True), ("fill", True), ("train", False), ("film", False)])
