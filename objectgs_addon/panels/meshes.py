@@ -59,6 +59,9 @@ class MeshesPanel(WithReconstruction, bpy.types.Panel):
             return
         layout.label(text="Show")
         layout.row().prop(properties, "shown", expand=True)
+        space = context.space_data
+        if properties.shown != "splats" and space is not None and space.shading.type == "SOLID":
+            write(layout, "Solid mode shows no textures; choose Material Preview in the viewport's header.", "INFO")
         layout.label(text="Shading")
         layout.row().prop(properties, "mesh_shading", expand=True)
         for mesh in scene.scene_meshes(root):

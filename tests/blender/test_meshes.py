@@ -793,6 +793,15 @@ def test_interrupted_meshing_is_named_after_reopening(active):
         assert "interrupted" not in texts_of(panels.meshes.MeshesPanel), "another program makes them"
 
 
+def test_panel_tells_which_mode_shows_textures(active):
+    window = bpy.context.window_manager.windows[0]
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    for mode, shown, told in (("SOLID", "meshes", True), ("SOLID", "splats", False), ("MATERIAL", "both", False)):
+        area.spaces.active.shading.type, active.objectgs.shown = mode, shown
+        with bpy.context.temp_override(window=window, area=area):
+            assert ("choose Material Preview" in texts_of(panels.meshes.MeshesPanel)) is told
+
+
 def test_meshes_made_after_saving_are_offered(active, folder, tmp_path):
     made = {path: path.read_bytes() for path in (folder / "meshes").iterdir()}
     differ = "The meshes in the folder differ from those shown. objectgs.show_result"
