@@ -13,6 +13,7 @@ from ..environment import locations
 from ..process.jobs import Job, State
 from ..running import background
 from ..running.job_display import write
+from ..running.wording import IMPORT_PHOTOS
 from ..state import folder_trust, visibility
 from ..state.folder_state import folder_state
 from ..state.next_step import IMPORT, RESUME, Step, find_step, is_capture_gone, next_step
@@ -110,7 +111,7 @@ def draw_message(layout: bpy.types.UILayout) -> None:
 
 
 def _draw_add(layout: bpy.types.UILayout) -> None:
-    layout.operator("objectgs.import_photos", icon="IMAGE_DATA")
+    layout.operator("objectgs.import_photos", text=IMPORT_PHOTOS, icon="IMAGE_DATA")
     layout.operator("objectgs.import_capture", icon="IMPORT")
     layout.operator("objectgs.open_reconstruction", icon="FILE_FOLDER")
     layout.operator("objectgs.import_splats", icon="POINTCLOUD_DATA")
@@ -162,7 +163,7 @@ def _draw_next_step(layout: bpy.types.UILayout, step: Step, jobs: list[tuple[int
     button.scale_y = 1.5
     if step == IMPORT:
         button = button.column(align=True)
-        button.operator("objectgs.import_photos", icon="IMAGE_DATA")
+        button.operator("objectgs.import_photos", text=IMPORT_PHOTOS, icon="IMAGE_DATA")
     _draw_button(button, step)
     if jobs:
         _draw_jobs(column, jobs)

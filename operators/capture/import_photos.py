@@ -21,7 +21,7 @@ from ..common.reporting import reports_errors
 
 class ImportPhotos(ImportDialog, bpy.types.Operator):
     bl_idname = "objectgs.import_photos"
-    bl_label = "Import Photos or Video"
+    bl_label = "Import Photos"  # Panels have more room than the button of the file browser.
     bl_description = (
         "Compute where the photos of a folder, the selected photos or the frames of a video were taken, in the "
         "background, and import them. This takes some minutes for tens of photos, and longer for hundreds"

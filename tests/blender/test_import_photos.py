@@ -83,6 +83,12 @@ def test_calibration_must_exist_and_is_used_again(submitted, tmp_path):
     assert len(submitted) == 2
 
 
+def test_button_of_the_file_browser_is_not_cut_off(submitted):
+    """It has the name of the operator and room for 18 characters; the panel says more."""
+    assert len(import_photos.ImportPhotos.bl_label) <= 18
+    assert "objectgs.import_photos Import Photos or Video" in texts_of(CapturePanel)
+
+
 def test_panel_tells_why_the_import_has_to_wait(submitted, tmp_path, monkeypatch):
     told = texts_of(CapturePanel)
     assert "The first button" in told and "wait for this job" not in told
