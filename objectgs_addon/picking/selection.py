@@ -77,6 +77,16 @@ def selected_collections(context: bpy.types.Context, root: bpy.types.Collection)
     return list(dict.fromkeys(collection for collection in found if collection is not None))
 
 
+def select_shown_parts(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> None:
+    """Select the visible parts of objects and duplicates of which any part is selected, such as new meshes."""
+    view_layer.update()
+    collections = {scene.collection_of(part) for part in view_layer.objects.selected}
+    for collection in collections & set(root.children_recursive):
+        for part in scene.parts_of(collection):
+            if part.visible_get(view_layer=view_layer) and not part.hide_select:
+                part.select_set(True, view_layer=view_layer)
+
+
 def active_duplicate(
     context: bpy.types.Context, root: bpy.types.Collection, object_id: int
 ) -> bpy.types.Collection | None:

@@ -167,6 +167,7 @@ def _show_meshes(job: Job, owner: bpy.types.Scene | None) -> bool:
         job.warnings.extend(shown.warnings)
         if shown.meshes and scene.shown_kinds(root) == "splats":
             scene.show_kinds(root, "meshes")
+        view.keep_outlines(root)
         object_edits.fill(root)
     return bool(roots) or _announce_hidden(job)
 

@@ -24,7 +24,7 @@ from ...backend.shared.expectation import PRESET_STEPS
 from ...backend.shared.formats.splat_ply import UNOBSERVED
 from .. import drawing
 from ..picking import marks
-from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, show_kinds, shown_kinds
+from ..scene import SHADINGS, SHOWS, is_linked, kind_of, shade_meshes, shading_of, shown_kinds
 from . import object_edits, viewports
 
 
@@ -231,7 +231,7 @@ class ReconstructionProperties(bpy.types.PropertyGroup):
             ("both", "Both", "Splats and meshes together", 2),
         ],
         get=lambda self: SHOWS.index(shown_kinds(self.id_data)),
-        set=lambda self, value: show_kinds(self.id_data, SHOWS[value]),
+        set=lambda self, value: viewports.show_kinds(self.id_data, SHOWS[value]),
     )
     mesh_shading: EnumProperty(
         name="Mesh Shading",

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from .. import drawing, scene
+from ..picking import selection
 from . import object_list, visibility
 
 
@@ -39,6 +40,19 @@ def hide_capture(root: bpy.types.Collection) -> None:
         for view_layer in owner.view_layers:
             if (layer := visibility.capture_layer(view_layer, root)) is not None:
                 layer.hide_viewport = True
+
+
+def show_kinds(root: bpy.types.Collection, which: str) -> None:
+    """Show splats, meshes or both, as `scene.show_kinds` does; selected objects stay outlined."""
+    scene.show_kinds(root, which)
+    keep_outlines(root)
+
+
+def keep_outlines(root: bpy.types.Collection) -> None:
+    """Select what has become visible of objects of which a part is selected."""
+    for owner in object_list.scenes_of(root):
+        for view_layer in owner.view_layers:
+            selection.select_shown_parts(view_layer, root)
 
 
 def colors_changed(properties: Any, _context: bpy.types.Context = None) -> None:

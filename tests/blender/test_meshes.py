@@ -17,7 +17,9 @@ from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.objectgs_addon import panels
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.environment import locations
-from objectgs.objectgs_addon.running import background
+from objectgs.objectgs_addon.picking import selection
+from objectgs.objectgs_addon.process.jobs import Job
+from objectgs.objectgs_addon.running import background, results
 from objectgs.objectgs_addon.scene import kinds
 from objectgs.objectgs_addon.scene.meshes import export as mesh_export
 from objectgs.objectgs_addon.state.folder_state import folder_state
@@ -791,6 +793,19 @@ def test_interrupted_meshing_is_named_after_reopening(active):
     assert "interrupted, and 2 meshes are missing. Extract Meshes continues" in texts_of(panels.meshes.MeshesPanel)
     with locked(folder):
         assert "interrupted" not in texts_of(panels.meshes.MeshesPanel), "another program makes them"
+
+
+def test_selected_objects_stay_outlined_when_meshes_replace_splats(active, folder):
+    active.objectgs.shown = "splats"
+    assert selection.select_object(bpy.context, active, 1)
+    splats, (other,) = parts(active, 1, "splats")[0], parts(active, 2, "splats")
+    assert splats.select_get() and not mesh_of(active, 1).select_get()
+    rewrite(folder, _1=tetrahedron(ORIGIN, 2.0), _2=tetrahedron(ORIGIN))
+    job = Job("Meshes", "mesh", folder, ["true"], folder)
+    assert results.SHOW_BY_KIND["mesh"](job, bpy.context.scene)
+    assert mesh_of(active, 1).select_get() and not mesh_of(active, 2).select_get()
+    active.objectgs.shown = "splats"
+    assert splats.select_get() and not mesh_of(active, 1).select_get() and not other.select_get()
 
 
 def test_panel_tells_which_mode_shows_textures(active):
