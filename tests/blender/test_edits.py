@@ -802,17 +802,6 @@ def parts_shown(root) -> list:
     return [part(root, kind) for kind in ("object_parent", "splats", "mesh")]
 
 
-def test_what_is_shown_of_selected_objects_is_selected(root):
-    pivot, splats, mesh = (part(root, kind) for kind in ("object_parent", "splats", "mesh"))
-    blender_scene.show_kinds(root, "splats")
-    choose(pivot, splats)
-    blender_scene.show_kinds(root, "meshes")
-    assert not splats.select_get() and mesh.select_get() and not part(root, "mesh", 2).select_get()
-    choose(part(root, "object_parent", 2))
-    blender_scene.show_kinds(root, "both")
-    assert not splats.select_get() and not mesh.select_get()
-
-
 def choose(*objs) -> None:
     bpy.ops.object.select_all(action="DESELECT")
     for obj in objs:

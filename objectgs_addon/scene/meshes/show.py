@@ -154,8 +154,7 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
 
     An object without a mesh, and what fills the hole of a removed object, always show their splats.
 
-    In addition, users can hide single objects by their collection or with the eye icon. What is shown of selected
-    objects is selected.
+    In addition, users can hide single objects by their collection or with the eye icon.
 
     Args:
         root: the reconstruction's collection.
@@ -164,15 +163,7 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
     if which not in SHOWS:
         raise ValueError(f"{which} cannot be shown")
     root[SHOW] = which
-    collections, copies = object_collections(root), duplicates_of(root)
-    wholes = [parts_of(each) for key in collections for each in (collections[key], *copies.get(key, ()))]
-    selected = [obj for parts in wholes if any(each.select_get() for each in parts) for obj in parts]
-    apply_shown(root, collections)
-    if selected:
-        bpy.context.view_layer.update()  # Otherwise, what was hidden does not count as visible yet.
-    for obj in selected:
-        if obj.visible_get() and not obj.hide_select:
-            obj.select_set(True)
+    apply_shown(root, object_collections(root))
 
 
 def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> None:
