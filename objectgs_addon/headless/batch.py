@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import time
 import traceback
+from collections import Counter
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,7 @@ def batch(options: argparse.Namespace) -> None:
             _run_one(capture, out / capture.name, entry, wanted, summary, options)
             in_use += entry["state"] == UNFINISHED
     summary.read()
-    options.reporter.status(f"{summary.sentence()} See {out / 'batch.md'}.")
+    options.reporter.status(f"{_sentence(summary.entries)} See {out / 'batch.md'}.")
     if unusable := summary.count(BAD_INPUT) + in_use:
         raise InputError(f"{unusable} of {len(captures)} captures cannot be used.")
     if summary.count(FAILED):
@@ -174,13 +175,15 @@ def _run_one(
 class _Summary:
     """Summary in batch.json and batch.md in `folder`, with one entry per capture.
 
-    The files are read again before each change, since another computer may run other captures of the same folder.
+    The files are read again before each change, since another computer may run other captures. Entries of captures that
+    are not among `captures` are kept if `folder` has results of them.
     """
 
     def __init__(self, folder: Path, captures: list[Path]) -> None:
         self.json, self.table = folder / "batch.json", folder / "batch.md"
         self.names = [legible(capture.name) for capture in captures]
         self.entries: list[dict[str, Any]] = []
+        self.others: list[dict[str, Any]] = []
         with self._alone():
             self.read()
             self._write()
@@ -197,7 +200,7 @@ class _Summary:
             self._write()
 
     def read(self) -> None:
-        """Read the entries of all captures."""
+        """Read all entries."""
         known: dict[str, dict[str, Any]] = {}
         if self.json.exists():
             content = read_json(self.json)
@@ -207,6 +210,8 @@ class _Summary:
                 raise InputError(f"{self.json} was not written by this program; choose another --out.") from error
         fresh = {**_NOTHING, "seconds": 0.0, "settings": None}
         self.entries = [{"name": name, **fresh, **known.get(name, {})} for name in self.names]
+        others = [name for name in known if name not in self.names and is_folder(self.json.parent / name)]
+        self.others = [{**fresh, **known[name]} for name in others]
 
     def _alone(self) -> AbstractContextManager[None]:
         return locked(self.json.parent, _LOCK, _PATIENCE)
@@ -214,15 +219,12 @@ class _Summary:
     def count(self, state: str) -> int:
         return sum(entry["state"] == state for entry in self.entries)
 
-    def sentence(self) -> str:
-        parts = [f"{self.count(state)} {state}" for state in (DONE, BAD_INPUT, FAILED, UNFINISHED) if self.count(state)]
-        return f"{len(self.entries)} captures: {', '.join(parts)}."
-
     def _write(self) -> None:
-        write_json(self.json, {"captures": self.entries})
+        entries = [*self.entries, *self.others]
+        write_json(self.json, {"captures": entries})
         heads = ("capture", "state", "seconds", "PSNR", *MIOU_LABELS.values(), "splats", "error")
         lines = ["| " + " | ".join(heads) + " |", "|---|---|---:|---:|---:|---:|---:|---|"]
-        for entry in self.entries:
+        for entry in entries:
             cells = (
                 entry["name"],
                 entry["state"],
@@ -235,7 +237,13 @@ class _Summary:
                 entry["error"] or "",
             )
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
-        write_atomic(self.table, (f"{self.sentence()}\n\n" + "\n".join(lines) + "\n").encode())
+        write_atomic(self.table, (f"{_sentence(entries)}\n\n" + "\n".join(lines) + "\n").encode())
+
+
+def _sentence(entries: list[dict[str, Any]]) -> str:
+    counts = Counter(entry["state"] for entry in entries)
+    parts = [f"{counts[state]} {state}" for state in (DONE, BAD_INPUT, FAILED, UNFINISHED) if counts[state]]
+    return f"{len(entries)} captures: {', '.join(parts)}."
 
 
 def _figure(value: float | None, form: str) -> str:

@@ -24,7 +24,7 @@ from objectgs.backend.shared.console import ConsoleReporter
 from objectgs.backend.shared.formats.ply import read_vertices
 from objectgs.backend.shared.reconstruction.lock import locked
 from objectgs.objectgs_addon.headless import COMMANDS, commands
-from objectgs.objectgs_addon.headless.batch import fingerprint
+from objectgs.objectgs_addon.headless.batch import _Summary, fingerprint
 from objectgs.objectgs_addon.headless.picture import open_blend
 
 import headless
@@ -643,6 +643,20 @@ def test_batches_of_two_computers_leave_captures_to_each_other(capture, tmp_path
             (out / "batch.json").write_text(json.dumps({"captures": list(entries.values())}))
             assert headless.main([*words, answering(tmp_path)]) == 0
     assert not list(out.glob(".*.lock"))
+
+
+def test_batch_keeps_results_of_captures_that_another_one_runs(tmp_path):
+    """Of a capture that was added since this batch began, or of another folder of captures."""
+    own = _Summary(tmp_path, [Path("one"), Path("two")])
+    other = _Summary(tmp_path, [Path("one"), Path("three"), Path("gone")])
+    (tmp_path / "three").mkdir()
+    three = other.entry("three") | {"state": "done", "psnr": 30.0}
+    other.update(three)
+    own.update(own.entry("one") | {"state": "done"})
+    assert other.entry("three") == three and list(summary(tmp_path)) == ["one", "two", "three"]
+    table = (tmp_path / "batch.md").read_text()
+    assert table.startswith("3 captures: 2 done, 1 unfinished.") and "| three | done |" in table
+    assert own.count("done") == 1
 
 
 def test_batch_tells_of_captures_that_another_program_uses(capture, tmp_path, monkeypatch, capsys):
