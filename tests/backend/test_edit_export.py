@@ -328,6 +328,10 @@ def test_invalid_exports_are_rejected(run_command, folder, tmp_path):
     assert_rejected(run_command("export", folder.folder, "--out", tmp_path), "is a folder")
     (tmp_path / "file").touch()
     assert_rejected(run_command("export", folder.folder, "--out", tmp_path / "file", "--per-object"), "is a file")
+    before = set(folder.folder.iterdir())
+    result = run_command("export", folder.folder, "--out", folder.folder / "." / "", "--per-object")
+    assert_rejected(result, "the reconstruction's own folder")
+    assert set(folder.folder.iterdir()) == before
     assert_rejected(
         run_command("export", folder.folder, "--out", tmp_path / "a.ply", "--objects", "jug"), "no object jug"
     )

@@ -15,6 +15,7 @@ from ...export import DOWN_TO_UP, background_sphere, coarser_splats, read_splats
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
+from ...shared.formats.regular_file import resolved
 from ...shared.formats.splat_ply import Description
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
@@ -37,6 +38,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{folder.settings} names no background to bake; train on, or leave out --bake-background.")
     if options.to_world is not None and options.coordinates != "blender":
         raise InputError("--to-world is for --coordinates blender; add this, or leave out --to-world.")
+    if options.per_object and resolved(options.out) == resolved(folder.folder):
+        raise InputError(f"{options.out} is the reconstruction's own folder; name another one for the objects' files.")
     kind = _format(options)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
