@@ -601,6 +601,20 @@ def test_baked_background_looks_like_background(tmp_path, folder, run_command):
             assert float((shown.color - wanted).abs().max()) < 0.03
 
 
+@pytest.mark.parametrize("coordinates", ["capture", "blender"])
+def test_baked_background_is_whole_in_coarser_levels(tmp_path, folder, run_command, coordinates):
+    write_splats(folder.splats, some_splats(5 * 1034))
+    update_record(folder, export=ExportRecord(splats=5 * 1034, anchors=6, background=[0.2, 0.55, 0.9]))
+    options = ["--levels", "2", "--bake-background", "--coordinates", coordinates]
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", *options, "--json")
+    assert result.code == EXIT_DONE and result.events[-1]["splats"] == 5 * 1034 + 1000
+    full, *coarser = (read_splats(tmp_path / name)[0] for name in ("all.ply", "all-1.ply", "all-2.ply"))
+    sphere = full.select(slice(-1000, None))
+    for level, version in enumerate(coarser, 1):
+        assert len(version) == 5 * (1024 // 4**level + 10) + 1000
+        assert np.array_equal(version.means[-1000:], sphere.means)
+
+
 def _drawn(splats, camera):
     values = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh)
     tensors = [torch.from_numpy(np.ascontiguousarray(value, np.float32)) for value in values]

@@ -63,8 +63,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed and moved objects")
     if options.sh_degree is not None:
         splats = splats.with_degree(options.sh_degree)
-    if options.bake_background and background:
-        splats = concatenate([splats, background_sphere(splats, background)])
+    sphere = background_sphere(splats, background) if options.bake_background and background else None
     upright = read_upright(folder)
     splats = _in_coordinates(splats, options, upright, y_up=kind == "spz")
     versions = {options.out: splats}
@@ -72,6 +71,10 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         reporter.status("Merging splats")
         for level, coarser in enumerate(coarser_splats(splats, options.levels), 1):
             versions[options.out.with_name(f"{options.out.stem}-{level}{options.out.suffix}")] = coarser
+    if sphere is not None:  # Merged splats of the sphere would have gaps.
+        sphere = _in_coordinates(sphere, options, upright, y_up=kind == "spz")
+        versions = {path: concatenate([version, sphere]) for path, version in versions.items()}
+        splats = versions[options.out]
     files = {
         path: (version, ids)
         for out, version in versions.items()
