@@ -25,7 +25,7 @@ FAR = 1e10
 """Depth of empty pixels, as in Blender."""
 
 _KEPT = 16
-"""Number of objects of each pixel that are kept while the samples of a frame are summed."""
+"""Most objects of each pixel that are kept while the samples of a frame are summed."""
 _FAINTEST = 1e-6
 
 _Planes = tuple[NDArray[np.float32], NDArray[np.float32] | None, list[NDArray]]
@@ -63,7 +63,7 @@ def draw_frame(stage: Stage, shot: Shot, frame: Frame, after_sample: Callable[[i
     count, shape = len(frame.samples), (shot.height, shot.width)
     rgba = np.zeros((*shape, 4), np.float32)
     depth = np.full(shape, FAR, np.float32)
-    kept = RANKS if count == 1 else _KEPT
+    kept = RANKS if count == 1 else min(_KEPT, max(RANKS, len(stage.names)))
     ids = np.full((*shape, kept), -1, np.int32)
     coverage = np.zeros((*shape, kept), np.float32)
     for number, sample in enumerate(frame.samples):

@@ -17,7 +17,7 @@ from backend.export.ply import read_splats, write_splats
 from backend.film import cryptomatte, exr
 from backend.film.render import FAR
 from backend.model.splats import Splats, concatenate
-from backend.raster import Camera, rasterize
+from backend.raster import Camera, object_ranks, rasterize
 from backend.raster.ranked_ids import add_ranked
 from backend.raster.reference import rasterize_reference
 from backend.shared.color.recolor import Recolor
@@ -227,7 +227,14 @@ def test_clip_range_and_depth_scale(folder, film):
         assert (planes["Z"][~seen] == np.float32(FAR)).all() and (~seen).any()
 
 
-def test_motion_blur_is_mean_of_samples(folder, film):
+def test_motion_blur_is_mean_of_samples(folder, film, monkeypatch):
+    ranks = []
+
+    def watched(drawn, count):
+        ranks.append(count)
+        return object_ranks(drawn, count)
+
+    monkeypatch.setattr("backend.film.render.object_ranks", watched)
     moments = [sample(x, {2: Placed(maps=moved(3 * x)[None])}, time=1 + x) for x in (-0.1, -0.03, 0.05)]
     blurred, *single = film(shot_of(moments, *([moment] for moment in moments)))
     mean = np.mean([rgba_of(planes) for planes in single], 0)
@@ -237,6 +244,7 @@ def test_motion_blur_is_mean_of_samples(folder, film):
     assert np.array_equal(blurred["Z"], single[1]["Z"])
     ranked = np.stack([blurred[f"CryptoObject{i:02d}.{side}"] for i in range(3) for side in "GA"])
     assert (np.diff(ranked, axis=0) <= 0).all()
+    assert set(ranks) == {cryptomatte.RANKS}, "more than the scene has objects take memory for nothing"
 
 
 def test_ranked_ids_are_summed():
