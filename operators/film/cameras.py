@@ -4,6 +4,7 @@
 import bpy
 
 from ...backend.shared.errors import InputError
+from ...backend.shared.formats.photos_source import natural_order
 from ...objectgs_addon import film, scene
 from ..common import need
 from ..common.reporting import reports_errors
@@ -54,7 +55,7 @@ class CameraPath(bpy.types.Operator):
         cameras = [part for part in need.active_root(context).all_objects if scene.kind_of(part) == "camera"]
         if len(cameras) < 2:
             raise InputError("A path needs at least two captured views; import the capture again")
-        cameras.sort(key=lambda camera: camera["objectgs_image"])
+        cameras.sort(key=lambda camera: natural_order(camera["objectgs_image"]))
         film.make_path(owner, cameras, owner.frame_start, owner.frame_end)
         owner.frame_set(owner.frame_current)  # Otherwise the camera stays at its last key.
 

@@ -93,6 +93,24 @@ def test_path_passes_through_captured_views(root):
     assert max(min(step, 2 * np.pi - step) for step in steps) < 0.2
 
 
+def test_path_follows_numbers_without_zeros(root):
+    """The names of 14 photos in the order of letters, 1, 10, 11, ..., 2, are a path that jumps back and forth."""
+    cameras = sorted((part for part in root.all_objects if scene.kind_of(part) == "camera"), key=lambda part: part.name)
+    for camera in cameras[14:]:
+        bpy.data.objects.remove(camera)
+    for number, camera in enumerate(cameras[:14], 1):
+        camera["objectgs_image"] = f"IMG_{number}.jpg"
+    owner = bpy.context.scene
+    assert bpy.ops.objectgs.camera_path() == {"FINISHED"}
+    places = []
+    for frame in range(owner.frame_start, owner.frame_end + 1):
+        owner.frame_set(frame)
+        places.append(np.array(owner.camera.matrix_world)[:3, 3])
+    travelled = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    direct = sum((b.location - a.location).length for a, b in itertools.pairwise(cameras[:14]))
+    assert travelled == pytest.approx(direct, rel=0.05)
+
+
 def test_next_step_follows_the_state(root, monkeypatch):
     owner = bpy.context.scene
     monkeypatch.setenv("OBJECTGS_PYTHON", "/no/such/python")
