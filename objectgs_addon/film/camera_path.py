@@ -14,6 +14,9 @@ from ..scene import matrix_to_world
 MOST_KEYS = 12
 """Number of cameras that the path passes through; more would repeat the shaking of a hand."""
 
+_MOST_ORDERED = 500
+"""Number of cameras that are put in order, which takes time and memory by its square."""
+
 _LENS = ("sensor_fit", "sensor_width", "sensor_height", "lens", "shift_x", "shift_y", "clip_start", "clip_end")
 """Settings of a camera that another one gets."""
 
@@ -53,10 +56,11 @@ def make_path(scene: bpy.types.Scene, cameras: Sequence[bpy.types.Object], first
     Returns:
         The camera, which has the lens of the first of them.
     """
+    cameras = [cameras[index] for index in _spread(len(cameras), _MOST_ORDERED)]
     # Blender does not update the matrices of cameras in a collection that is excluded from the view layer.
     poses = [Matrix(matrix_to_world(camera).tolist()) for camera in cameras]
     order = path_order(np.array([pose.translation for pose in poses]))
-    chosen = order[np.unique(np.linspace(0, len(order) - 1, min(len(order), MOST_KEYS)).round().astype(int))]
+    chosen = order[_spread(len(order), MOST_KEYS)]
     moving = new_camera(scene, "Camera Path", cameras[chosen[0]].data)
     before = None
     for frame, index in zip(np.linspace(first, last, len(chosen)), chosen.tolist()):
@@ -68,6 +72,11 @@ def make_path(scene: bpy.types.Scene, cameras: Sequence[bpy.types.Object], first
         for name in ("location", "rotation_quaternion"):
             moving.keyframe_insert(name, frame=float(frame))
     return moving
+
+
+def _spread(count: int, most: int) -> np.ndarray:
+    """Return at most `most` of the indices 0 .. count - 1, evenly from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def new_camera(scene: bpy.types.Scene, name: str, like: bpy.types.Camera | None) -> bpy.types.Object:

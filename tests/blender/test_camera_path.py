@@ -3,6 +3,7 @@
 
 import itertools
 import sys
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from objectgs.objectgs_addon import scene
-from objectgs.objectgs_addon.film.camera_path import path_order
+from objectgs.objectgs_addon.film.camera_path import make_path, path_order
 from objectgs.objectgs_addon.panels.capture import CapturePanel
 from objectgs.objectgs_addon.process.jobs import Job
 from objectgs.objectgs_addon.running import background
@@ -109,6 +110,20 @@ def test_path_follows_numbers_without_zeros(root):
     travelled = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
     direct = sum((b.location - a.location).length for a, b in itertools.pairwise(cameras[:14]))
     assert travelled == pytest.approx(direct, rel=0.05)
+
+
+def test_path_of_many_cameras_needs_little_memory(fresh):
+    data, cameras = bpy.data.cameras.new("lens"), []
+    for center in np.random.default_rng(0).permutation(circle(3000))[:2500]:
+        cameras.append(bpy.data.objects.new("photo", data))
+        cameras[-1].location = center
+    tracemalloc.start()
+    moving = make_path(bpy.context.scene, cameras, 1, 100)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+    bpy.context.scene.frame_set(1)
+    assert (moving.location - cameras[0].location).length < 1e-6
 
 
 def test_next_step_follows_the_state(root, monkeypatch):
