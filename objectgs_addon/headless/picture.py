@@ -140,6 +140,9 @@ def _render(scene: bpy.types.Scene, path: Path) -> None:
         settings.media_type = "IMAGE"
     settings.file_format = FORMATS[path.suffix.lower()]
     scene.render.filepath = str(path)
+    if bpy.app.version >= (5, 0):  # Braces are variables there.
+        scene.render.filepath = str(path).replace("{", "{{").replace("}", "}}")
+    scene.render.use_multiview = False  # It writes two files of other names.
     scene.render.use_file_extension = False
     try:
         with quiet(), _ended_by_signals(path):

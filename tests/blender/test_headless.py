@@ -25,7 +25,7 @@ from objectgs.backend.shared.formats.ply import read_vertices
 from objectgs.backend.shared.reconstruction.lock import locked
 from objectgs.objectgs_addon.headless import COMMANDS, commands
 from objectgs.objectgs_addon.headless.batch import _Summary, fingerprint
-from objectgs.objectgs_addon.headless.picture import open_blend
+from objectgs.objectgs_addon.headless.picture import open_blend, write_picture
 
 import headless
 
@@ -511,6 +511,18 @@ def test_demo_stops_when_stdin_closes(tmp_path):
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 130, output + errors
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "stereo"), [("a{b}c", False), ("{blend_name}", False), ("a", True)])
+def test_picture_is_written_to_paths_with_braces_and_from_stereo_files(fresh, tmp_path, name, stereo):
+    target = bpy.context.scene
+    target.camera = bpy.data.objects.new("eye", bpy.data.cameras.new("eye"))
+    target.collection.objects.link(target.camera)
+    target.render.engine, target.cycles.samples = "CYCLES", 1
+    target.render.resolution_x = target.render.resolution_y = 16
+    target.render.use_multiview = stereo
+    write_picture(target, tmp_path / name / f"{name}.png")
+    assert [path.relative_to(tmp_path) for path in tmp_path.rglob("*.png")] == [Path(name, f"{name}.png")]
 
 
 @pytest.mark.long
