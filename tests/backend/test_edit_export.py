@@ -266,6 +266,16 @@ def test_export_per_object_writes_one_file_each(run_command, folder, tmp_path):
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["can.splat"]
 
 
+def test_export_names_chosen_objects_without_splats(run_command, folder, tmp_path):
+    edit_objects(folder.objects, {3: {"merged_into": 7}})
+    run_command("edit", folder.folder, "--remove", "mug")
+    chosen = ["--objects", "mug", "can", "3", "1"]
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", "--json", *chosen)
+    assert result.code == EXIT_DONE and result.events[-1]["splats"] == 24
+    (warning,) = result.messages("warning")
+    assert warning.startswith("No splats of mug are left to export, since")
+
+
 def test_export_writes_coarser_levels(run_command, folder, tmp_path):
     write_splats(folder.splats, some_splats(5 * (1024 + 10)))
     result = run_command("export", folder.folder, "--out", tmp_path / "all.ply", "--levels", "2", "--json")

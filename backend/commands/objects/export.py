@@ -26,6 +26,7 @@ from ..folder import READ
 
 _FORMATS = ("ply", "spz", "splat")
 _MOST_LISTED = 10
+_SKIPPED = "since those that are deleted, cropped, or of removed or left-out objects are skipped."
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -42,7 +43,8 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError(f"{options.out} is the reconstruction's own folder; name another one for the objects' files.")
     kind = _format(options)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
-    chosen = [find_object(objects, word, folder.objects).id for word in options.objects or ()]
+    found = [find_object(objects, word, folder.objects) for word in options.objects or ()]
+    chosen = {entry.id: entry.name for entry in found}
     reporter.expect({READ: ("Reading", 3.0), "edit": ("Editing", 3.0), "write": ("Saving", 3.0)})
     reporter.begin(READ, f"Reading {folder.splats.name}")
     captured, warnings = read_splats(folder.splats)
@@ -53,12 +55,12 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.begin("edit", "Applying the edits")
     splats = apply_edits(captured, objects, reporter)
     if chosen:
-        splats = splats.select(np.isin(splats.object_ids, chosen))
+        splats = splats.select(np.isin(splats.object_ids, list(chosen)))
     if len(splats) == 0:
-        raise InputError(
-            f"No splats of {folder.splats} are left to export, since those that are deleted, cropped, or of removed or "
-            "left-out objects are skipped."
-        )
+        raise InputError(f"No splats of {folder.splats} are left to export, {_SKIPPED}")
+    present = set(np.unique(splats.object_ids).tolist())
+    if gone := [name for object_id, name in chosen.items() if object_id not in present]:
+        reporter.warning(f"No splats of {_listed(gone)} are left to export, {_SKIPPED}")
     if splats.unobserved.any():
         reporter.status(f"{splats.unobserved.sum():,} splats fill the holes of removed and moved objects")
     if options.sh_degree is not None:
@@ -129,11 +131,15 @@ def _warn_about_others(files: Iterable[Path], reporter: StoppingReporter) -> Non
         same = (path for path in folder.iterdir() if path.suffix.lower() in {own.suffix for own in written})
         others = sorted(path.name for path in same if path.with_name(path.name.lower()) not in written)
         if others:
-            more = f" and {len(others) - _MOST_LISTED} more" if len(others) > _MOST_LISTED else ""
             reporter.warning(
-                f"{folder} also contains {', '.join(others[:_MOST_LISTED])}{more}, which this export did not write; "
-                "delete what is of an earlier one."
+                f"{folder} also contains {_listed(others)}, which this export did not write; delete what is of an "
+                "earlier one."
             )
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return f"{', '.join(names[:_MOST_LISTED])}{more}"
 
 
 def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingReporter) -> None:
