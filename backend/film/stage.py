@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -142,4 +143,10 @@ def _digest_of(folder: Reconstruction, objects: list[SceneObject], primitive: st
 def _names(ids: list[int], entries: dict[int, SceneObject]) -> list[str]:
     """Return a name for each object; equal names get their ID, since mattes are selected by name."""
     names = [entries[i].name if i in entries else default_name(i) for i in ids]
-    return [f"{name} ({i})" if names.count(name) > 1 else name for name, i in zip(names, ids)]
+    counts, taken = Counter(names), set(names)
+    for at, i in enumerate(ids):
+        if counts[names[at]] > 1:
+            while names[at] in taken:
+                names[at] += f" ({i})"
+            taken.add(names[at])
+    return names

@@ -16,6 +16,7 @@ from backend.editing.apply import recolored, transformed
 from backend.export.ply import read_splats, write_splats
 from backend.film import cryptomatte, exr
 from backend.film.render import FAR
+from backend.film.stage import _names as shown_names
 from backend.model.splats import Splats, concatenate
 from backend.raster import Camera, object_ranks, rasterize
 from backend.raster.ranked_ids import add_ranked
@@ -24,7 +25,7 @@ from backend.shared.color.recolor import Recolor
 from backend.shared.color.srgb import decode, encode
 from backend.shared.errors import EXIT_CANCELLED, EXIT_DONE, InputError
 from backend.shared.reconstruction.folder import Reconstruction
-from backend.shared.reconstruction.objects import edit_objects, write_objects
+from backend.shared.reconstruction.objects import SceneObject, edit_objects, write_objects
 from backend.shared.reconstruction.record import TrainingRecord, VotesRecord, update_record
 from backend.shared.reconstruction.shot import Frame, Placed, Sample, Shot, chosen_frames, read_shot, write_shot
 
@@ -292,6 +293,13 @@ def test_cryptomatte_matches_specification(folder, film):
     wanted = {name: f"{cryptomatte.name_bits(name):08x}" for name in SHOWN_NAMES}
     assert json.loads(found[f"{key}/manifest"]) == wanted
     assert found["pixelAspectRatio"] == 1.5 and found["objectgs/frame"] == "1"
+
+
+def test_each_object_has_a_matte_of_its_own():
+    names = {1: "mug", 2: "mug", 3: "mug (1)", 4: "can"}
+    entries = {i: SceneObject(i, name, (0, 0, 0), 0) for i, name in names.items()}
+    found = shown_names([1, 2, 3, 4], entries)
+    assert found[1:] == ["mug (2)", "mug (1)", "can"] and len(set(found)) == 4
 
 
 def test_srgb_encoding_round_trip():
