@@ -29,7 +29,7 @@ class SetUpCompositor(UsesOutputFolder, bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> None:
         root, owner = need.active_root(context), context.scene
         self.remember_output(context)
-        item = object_list.active_item(root)
+        item = object_list.shown_item(root)
         film.set_up_compositor(
             owner,
             context.view_layer,

@@ -916,6 +916,19 @@ def test_compositor_operator_says_what_it_changes_and_what_is_wrong(root, regist
     assert "Warning: Renders show these twice" in printed and "Warning: The colors change." in printed
 
 
+def test_compositor_operator_shows_the_matte_of_what_the_active_object_is_merged_into(root, registered, monkeypatch):
+    bpy.context.scene.objectgs.active = root
+    bpy.ops.objectgs.use_folder()
+    mattes = []
+    monkeypatch.setattr(film, "set_up_compositor", lambda *arguments: mattes.append(arguments[-1]))
+    first, second = root.objectgs.objects[:2]
+    root.objectgs.active_object = 0
+    bpy.ops.objectgs.set_up_compositor()
+    first.is_merged, first.merged_into = True, second.object_id
+    bpy.ops.objectgs.set_up_compositor()
+    assert mattes == [first.name, second.name]
+
+
 @pytest.mark.long
 def test_film_operators_use_panel_settings(shot_blend, backend_python, registered, monkeypatch, tmp_path):
     """Operators for film frames and the compositor use the panel's folder, and report why they fail."""
