@@ -17,7 +17,7 @@ from ...backend.shared.formats.atomic import write_atomic
 from ...backend.shared.formats.file_names import legible
 from ...backend.shared.formats.json_file import read_json, write_json
 from ...backend.shared.formats.regular_file import is_folder
-from ...backend.shared.reconstruction.folder import Reconstruction
+from ...backend.shared.reconstruction.folder import IGNORED, Reconstruction
 from ...backend.shared.reconstruction.lock import FolderInUse, locked
 from ...backend.shared.reconstruction.report import MIOU_LABELS, read_report
 from ...backend.shared.version import __version__
@@ -112,9 +112,13 @@ def _text(path: Path) -> str:
 
 
 def fingerprint(capture: Path) -> list[int]:
-    """Return the number, total size in bytes and latest modification time (ns) of a capture's files."""
+    """Return the number, total size in bytes and latest modification time (ns) of a capture's files.
+
+    Files that file browsers make are left out.
+    """
     paths = [path for part in ("images", "masks", "sparse") for path in (capture / part).rglob("*")]
     paths += [path for path in capture.iterdir() if path.suffix.lower() in _CAPTURE_FILES]
+    paths = [path for path in paths if path.name not in IGNORED and not path.name.startswith(".")]
     states = [path.stat() for path in paths if path.is_file()]
     return [len(states), sum(state.st_size for state in states), max((s.st_mtime_ns for s in states), default=0)]
 
