@@ -26,12 +26,13 @@ class CameraFromView(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         space, region = context.space_data, context.region_data
         matrix = region.view_matrix.inverted()
-        seen = context.scene.camera if region.view_perspective == "CAMERA" else None
+        seen = space.camera if region.view_perspective == "CAMERA" else None
         camera = film.new_camera(context.scene, "Camera", None if seen is None else seen.data)
         if seen is None:
             camera.data.lens = space.lens / 2.0  # The viewport's lens is for twice the sensor of a camera.
             camera.data.clip_start, camera.data.clip_end = space.clip_start, space.clip_end
         camera.matrix_world = matrix
+        space.camera = camera  # The viewport may have a local camera.
         region.view_perspective = "CAMERA"
         return {"FINISHED"}
 

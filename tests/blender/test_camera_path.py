@@ -126,6 +126,27 @@ def test_path_of_many_cameras_needs_little_memory(fresh):
     assert (moving.location - cameras[0].location).length < 1e-6
 
 
+@pytest.mark.parametrize("local", [False, True])
+def test_camera_from_view_has_the_lens_of_the_camera_that_is_seen(root, local):
+    """The viewport's local camera, if it has one, which is then replaced by the new one."""
+    owner, (window,) = bpy.context.scene, bpy.context.window_manager.windows
+    area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
+    space, region = area.spaces.active, next(region for region in area.regions if region.type == "WINDOW")
+    of_scene, own = (bpy.data.objects.new(name, bpy.data.cameras.new(name)) for name in ("of scene", "own"))
+    of_scene.data.lens, own.data.lens = 33.0, 77.0
+    for camera in (of_scene, own):
+        owner.collection.objects.link(camera)
+    owner.camera = of_scene
+    space.use_local_camera = local
+    if local:
+        space.camera = own
+    space.region_3d.view_perspective = "CAMERA"
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        assert bpy.ops.objectgs.camera_from_view() == {"FINISHED"}
+    assert owner.camera not in (of_scene, own) and owner.camera.data.lens == (77.0 if local else 33.0)
+    assert space.camera == owner.camera and space.region_3d.view_perspective == "CAMERA"
+
+
 def test_next_step_follows_the_state(root, monkeypatch):
     owner = bpy.context.scene
     monkeypatch.setenv("OBJECTGS_PYTHON", "/no/such/python")
