@@ -42,6 +42,8 @@ class ExportDialog:
         return {"RUNNING_MODAL"}
 
     def check(self, _context: bpy.types.Context) -> bool:
+        if not bpy.path.basename(self.filepath):  # The file browser gives the folder alone then.
+            return False
         wanted = str(self._named(Path(self.filepath)))
         changed, self.filepath = wanted != self.filepath, wanted
         return changed
@@ -61,7 +63,7 @@ class ExportDialog:
         Raises:
             InputError: no file is chosen, or no object is selected.
         """
-        if not self.filepath:
+        if not (self.filepath if self.per_object else bpy.path.basename(self.filepath)):
             raise InputError("Choose a file to write")
         ids = None
         if self.objects == "SELECTED":

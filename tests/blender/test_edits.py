@@ -10,6 +10,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -34,6 +35,7 @@ from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.graph import VERSION, Graph
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
 from objectgs.objectgs_addon.state import click_selection, object_edits, object_list, visibility
+from objectgs.operators.common.export_dialog import ExportDialog
 from objectgs.operators.splats import import_splats
 
 import headless
@@ -1411,6 +1413,18 @@ def test_splats_that_blender_shows_as_a_point_are_not_exported(root, monkeypatch
     bpy.context.view_layer.update()
     with pytest.raises(RuntimeError, match="is scaled to zero by its parent; set a scale other than zero"):
         bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), coordinates="blender")
+
+
+@pytest.mark.parametrize("folder_alone", ["/home/x/", "/"])
+def test_export_dialog_leaves_a_folder_without_a_file_name_alone(root, folder_alone):
+    class Dialog(ExportDialog):
+        filepath, format, per_object = folder_alone, "obj", False
+        properties = SimpleNamespace(bl_rna=bpy.ops.objectgs.export_meshes.get_rna_type())
+
+    dialog = Dialog()
+    assert dialog.check(None) is False and dialog.filepath == folder_alone
+    with pytest.raises(RuntimeError, match="Choose a file to write"):
+        bpy.ops.objectgs.export_meshes(filepath=folder_alone, format="obj")
 
 
 @pytest.mark.long
