@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from backend.shared.color.recolor import Recolor
@@ -13,6 +14,7 @@ from backend.shared.reconstruction.objects import (
     SceneObject,
     edit_objects,
     forget_vanished,
+    is_singular,
     members_of,
     merged,
     read_objects,
@@ -103,6 +105,15 @@ def test_objects_scaled_to_nothing_keep_the_file_usable(path):
     path.write_text(json.dumps({**json.loads(before), "edits": {"1": {"transform": flat, "copies": [MOVED, flat]}}}))
     mug = read_objects(path)[0]
     assert mug.transform is None and mug.copies == (MOVED,)
+
+
+def test_what_is_flat_within_single_precision_is_scaled_to_nothing():
+    turn = np.linalg.qr(np.array([[1.0, 2.0, 3.0], [0.0, 1.0, 4.0], [5.0, 6.0, 0.0]]))[0]
+    for size, expected in ((0.0, True), (1e-4, False)):
+        for scale in (1e-3, 1.0, 1e3):
+            found = np.eye(4)
+            found[:3, :3] = (scale * turn @ np.diag([size, 1.0, 1.0]) @ turn.T).astype(np.float32)
+            assert is_singular(found) == expected
 
 
 def test_only_editable_fields_are_changed(path):

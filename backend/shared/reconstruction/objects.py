@@ -296,8 +296,12 @@ def _flattens(value: Any) -> bool:
 
 
 def is_singular(matrix: np.ndarray) -> bool:
-    """Return whether a map (4, 4) flattens what it moves, such as that of an object which is scaled to nothing."""
-    return bool(abs(np.linalg.det(matrix[:3, :3])) < 1e-30)
+    """Return whether a map (4, 4) flattens what it moves, such as that of an object which is scaled to nothing.
+
+    Zero is zero within single precision, as of an object that Blender has scaled between rotations.
+    """
+    volume, sides = abs(np.linalg.det(matrix[:3, :3])), np.linalg.norm(matrix[:3, :3], axis=0)
+    return bool(volume < 1e-30 or volume < 1e-6 * sides.prod())
 
 
 def affine_map(value: Any) -> Matrix:
