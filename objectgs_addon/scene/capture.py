@@ -16,6 +16,7 @@ from ...backend.shared.formats.photos_source import read_photo_errors
 from ...backend.shared.reconstruction.cameras import read_cameras
 from . import carrier
 from .cameras import has_size, show_cameras, use_camera, use_size, widen_clipping
+from .edits.axes import put_below, renew_axes
 from .kinds import (
     CAMERA,
     CAPTURE,
@@ -183,11 +184,12 @@ def _stand_up(root: bpy.types.Collection, upright: np.ndarray, views: Any) -> bp
         for obj in root.all_objects:
             of_all = kind_of(obj) == MESH and object_id_of(obj) is None
             if obj.parent is None and (of_all or kind_of(obj) in (CAMERA, POINTS, OBJECT_PARENT)):
-                obj.parent = parent
+                put_below(obj, parent)
     elif list(parent.get(UPRIGHT, ())) != _numbers(parent.matrix_basis):
         return parent
     parent.matrix_basis = wanted
     parent[UPRIGHT] = _numbers(parent.matrix_basis)
+    renew_axes(root, parent)
     return parent
 
 

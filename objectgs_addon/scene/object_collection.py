@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 
 from ...backend.shared.color.palette import to_linear
+from .edits.axes import give_axes, part_axes, put_below, set_local_map
 from .kinds import (
     MESH,
     MESH_MATERIAL,
@@ -57,11 +58,15 @@ def ensure_pivot(
             size = 0.2 * float(np.median(np.linalg.norm(positions - center, axis=1))) or 1.0
         pivot.empty_display_size = size if parent is None else min(size, parent.empty_display_size)
         pivot[CENTER] = center.tolist()
-        pivot.location = center
         pivot.parent = parent
+        if parent is not None:
+            give_axes(pivot, parent)
+        place = np.eye(4)
+        place[:3, 3] = center
+        set_local_map(pivot, place @ np.linalg.inv(part_axes(pivot)))
         for part in parts_of(collection):
             if part.parent is None:
-                part.parent = pivot
+                put_below(part, pivot)
         collection.objects.link(pivot)
     collection[CENTER] = center_of(pivot).tolist()
     return pivot

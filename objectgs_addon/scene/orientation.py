@@ -10,6 +10,7 @@ from mathutils import Matrix, Vector
 
 from ...backend.shared.errors import InputError
 from .cameras import widen_clipping
+from .edits.axes import renew_axes
 from .edits.placement import matrix_to_world
 from .kinds import CAMERA, capture_of, kind_of, require_parent
 
@@ -46,7 +47,7 @@ def orient_to_ground(root: bpy.types.Collection, p1: Any, p2: Any, p3: Any) -> N
     center = (p1 + p2 + p3) / 3.0
     turn = normal.rotation_difference(Vector((0.0, 0.0, 1.0))).to_matrix().to_4x4()
     on_ground = Matrix.Translation((center.x, center.y, 0.0))
-    _move(parent, on_ground @ turn @ Matrix.Translation(-center))
+    _move(root, parent, on_ground @ turn @ Matrix.Translation(-center))
 
 
 def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: float) -> None:
@@ -69,13 +70,14 @@ def scale_to_distance(root: bpy.types.Collection, p1: Any, p2: Any, distance: fl
         raise InputError("The two points coincide; pick two different points.")
     if not 0.0 < distance < float("inf"):
         raise InputError("The distance must be greater than 0.")
-    _move(parent, Matrix.Scale(distance / apart, 4))
+    _move(root, parent, Matrix.Scale(distance / apart, 4))
     widen_clipping(root)
 
 
-def _move(parent: bpy.types.Object, transform: Matrix) -> None:
+def _move(root: bpy.types.Collection, parent: bpy.types.Object, transform: Matrix) -> None:
     bpy.context.view_layer.update()
     parent.matrix_world = transform @ parent.matrix_world
+    renew_axes(root, parent)
     bpy.context.view_layer.update()
 
 

@@ -19,6 +19,7 @@ from ...backend.shared.reconstruction.edits.splat_edits import missing_sentence,
 from ...backend.shared.reconstruction.folder import Reconstruction
 from . import carrier
 from .capture import origin_of, put_capture_last
+from .edits.axes import put_below
 from .edits.floaters import mark_distant, mark_floaters, near_sphere_of
 from .edits.recover import recover_parts
 from .edits.show import show_edits
@@ -297,7 +298,7 @@ class _Makers:
         elif first is None:
             # Setting these makes Blender visit every object in the file; copies inherit them.
             obj.hide_render = obj.hide_viewport = True
-        obj.parent = pivot
+        put_below(obj, pivot)
         collection.objects.link(obj)
         return obj
 

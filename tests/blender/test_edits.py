@@ -406,6 +406,11 @@ def independent(root, local) -> np.ndarray:
     return moved + ORIGIN
 
 
+def in_capture(root, way) -> list[float]:
+    """Return a displacement in the world in the axes of the capture."""
+    return list(kinds.parent_of(root).matrix_world.to_3x3().inverted() @ Vector(way))
+
+
 @pytest.mark.long
 def test_transform_is_stored_in_capture_coordinates(root, folder, backend_python, tmp_path):
     parent = next(obj for obj in root.objects if blender_scene.kind_of(obj) == "parent")
@@ -554,7 +559,7 @@ def test_duplicate_shares_data_and_is_stored(root, folder):
     part(root, "object_parent").location.y += 1.0
     blender_scene.store_placements(root)
     ((*_, row),) = (np.array(place).T.tolist() for place in entry(root).copies)
-    assert row[:3] == pytest.approx([4.0, 0.0, 0.0], abs=1e-4)
+    assert row[:3] == pytest.approx(in_capture(root, [4.0, 0.0, 0.0]), abs=1e-4)
     assert entry(root).transform is not None
     place = independent(root, kinds.part_of(copy, "splats"))
     splats = read_vertices(folder / "splats.ply")
@@ -644,7 +649,7 @@ def test_blender_duplicates_become_stored_duplicates(root):
     assert kinds.part_of(copy, "object_parent") == twin
     assert kinds.part_of(copy, "splats").data == part(root, "splats").data, "the duplicate shares the original's data"
     assert len([obj for obj in collection_of(root).objects if blender_scene.kind_of(obj) == "splats"]) == 1
-    assert np.array(entry(root).copies[0])[:3, 3] == pytest.approx([2, 0, 0], abs=1e-4)
+    assert np.array(entry(root).copies[0])[:3, 3] == pytest.approx(in_capture(root, [2, 0, 0]), abs=1e-4)
     selection.select_object(bpy.context, root, 2)
     bpy.ops.object.select_all(action="DESELECT")
     part(root, "splats", 2).select_set(True)
@@ -1019,6 +1024,115 @@ def test_duplicates_of_objects_without_pivots_above_are_stored_once(root, parts_
     assert moved == pytest.approx(there, abs=1e-3)
 
 
+def fields(obj) -> tuple:
+    return tuple(obj.location), tuple(obj.rotation_euler), tuple(obj.scale)
+
+
+def test_transforms_of_objects_are_in_the_axes_of_the_world(root, folder, parts_shown):
+    pivot = parts_shown[0]
+    bpy.context.view_layer.update()
+    at = pivot.matrix_world.translation
+    captured = fields(pivot)
+    assert captured[0] == pytest.approx(tuple(at), abs=1e-5) and captured[1:] == ((0.0,) * 3, (1.0,) * 3)
+    expected = kinds.parent_of(root).matrix_world @ Vector(pivot["objectgs_center"])
+    assert tuple(at) == pytest.approx(tuple(expected), abs=1e-5)
+    assert all(fields(part) == ((0.0,) * 3, (0.0,) * 3, (1.0,) * 3) for part in parts_shown[1:])
+    before, center = seen(parts_shown), np.array(at)
+    pivot.location.x += 0.7
+    pivot.scale.z = 2.0
+    pivot.rotation_euler.z = math.pi / 2
+    moved = [
+        (points - center) * (1.0, 1.0, 2.0) @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + center + (0.7, 0.0, 0.0)
+        for points in before
+    ]
+    assert stay(parts_shown, moved)
+    there, stored = independent(root, parts_shown[1]), fields(pivot)
+    blender_scene.store_placements(root)
+    place = np.array(entry(root).transform)
+    edit_objects(folder / "objects.json", {1: {"transform": None}})
+    show_again(root)
+    assert fields(pivot) == captured and stay(parts_shown, before)
+    captured_at = independent(root, parts_shown[1])
+    assert there == pytest.approx(captured_at @ place[:3, :3].T + place[:3, 3], abs=2e-4)
+    edit_objects(folder / "objects.json", {1: {"transform": place.tolist()}})
+    show_again(root)
+    assert np.array(fields(pivot)) == pytest.approx(np.array(stored), abs=1e-5) and stay(parts_shown, moved)
+    choose(*parts_shown)
+    bpy.ops.object.rotation_clear()
+    bpy.ops.object.scale_clear()
+    assert stay(parts_shown, [points + np.array((0.7, 0.0, 0.0)) for points in before])
+    assert bpy.ops.objectgs.reset_object(what="TRANSFORM") == {"FINISHED"}
+    assert fields(pivot) == captured and stay(parts_shown, before)
+
+
+def test_transforms_of_duplicates_are_in_the_axes_of_the_world(root, parts_shown):
+    choose(*parts_shown)
+    bpy.ops.object.duplicate()
+    twins = sorted(bpy.context.selected_objects, key=lambda obj: obj.type != "EMPTY")
+    bpy.ops.objectgs.duplicate_object()
+    parent, before = kinds.parent_of(root), seen(twins)
+    twins[0].location.z += 1.0
+    blender_scene.store_placements(root)
+    assert stay(twins, [points + np.array((0.0, 0.0, 1.0)) for points in before])
+    other = next(
+        pivot
+        for copy in blender_scene.duplicates_of(root)[1]
+        if (pivot := kinds.part_of(copy, "object_parent")) != twins[0]
+    )
+    assert fields(other) == fields(parts_shown[0])
+    there = [seen(parts) for parts in (twins, parts_shown)]
+    move = Matrix.Translation((1, 2, 3)) @ Matrix.Rotation(0.4, 4, "Y") @ Matrix.Scale(1.5, 4)
+    parent.matrix_world = move @ parent.matrix_world
+    for parts, points in zip((twins, parts_shown), there):
+        wanted = [each @ np.array(move)[:3, :3].T + np.array(move)[:3, 3] for each in points]
+        assert stay(parts, wanted), "the parent empty carries all"
+    show_again(root)
+    assert entry(root).transform is None and not blender_scene.is_moved(root, collection_of(root))
+
+
+@pytest.mark.parametrize("deed", ["ground", "distance"])
+def test_transforms_stay_in_the_axes_of_the_world_after_orientation(root, folder, parts_shown, deed):
+    moved = [part(root, kind, 2) for kind in ("object_parent", "splats", "mesh")]
+    moved[0].location.x += 1.0
+    moved[0].rotation_euler.z = 0.5
+    lamp = bpy.data.objects.new("lamp", None)
+    bpy.context.scene.collection.objects.link(lamp)
+    lamp.parent, lamp.location = parts_shown[0], (0.1, 0.2, 0.3)
+    animated = part(root, "object_parent", HUGE)
+    animated.keyframe_insert("location", frame=1)
+    blender_scene.store_placements(root)
+    stored = (folder / "objects.json").read_bytes()
+    parent, keyed = kinds.parent_of(root), fields(animated)
+    relative = [placement.map_to(obj, parent) for obj in (*parts_shown[1:], *moved[1:], lamp, animated)]
+    if deed == "ground":
+        blender_scene.orient_to_ground(root, (0.0, 0.0, 0.0), (1.0, 0.0, 0.2), (0.0, 1.0, 0.1))
+    else:
+        blender_scene.scale_to_distance(root, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 3.0)
+    bpy.context.view_layer.update()
+    again = [placement.map_to(obj, parent) for obj in (*parts_shown[1:], *moved[1:], lamp, animated)]
+    assert np.array(again) == pytest.approx(np.array(relative), abs=1e-5)
+    place = (tuple(parts_shown[0].matrix_world.translation), (0.0,) * 3, (1.0,) * 3)
+    assert np.array(fields(parts_shown[0])) == pytest.approx(np.array(place), abs=1e-5)
+    before = seen(parts_shown)
+    parts_shown[0].location.y += 0.7
+    assert stay(parts_shown, [points + np.array((0.0, 0.7, 0.0)) for points in before])
+    parts_shown[0].location.y -= 0.7
+    assert fields(animated) == keyed
+    blender_scene.store_placements(root)
+    assert (folder / "objects.json").read_bytes() == stored
+
+
+def test_deleted_pivots_and_parents_are_made_again_in_place(root, parts_shown):
+    before = seen(parts_shown)
+    bpy.data.objects.remove(parts_shown[0])
+    show_again(root)
+    parts_shown[0] = part(root, "object_parent")
+    assert stay(parts_shown, before)
+    bpy.data.objects.remove(kinds.parent_of(root))
+    blender_scene.show_capture(bpy.context.scene, blender_scene.folder_of(root))
+    assert stay(parts_shown, before) and not blender_scene.is_moved(root, collection_of(root))
+
+
 # Undo.
 
 
@@ -1313,7 +1427,8 @@ def test_edits_survive_merge_and_split(root):
     object_edits.merge(root, [1], 2)
     assert 1 not in blender_scene.object_collections(root)
     assert object_edits.split(root, 2) == 1
-    assert blender_scene.placement_of(root, collection_of(root))[0, 3] == pytest.approx(1.0, abs=1e-4)
+    moved = blender_scene.placement_of(root, collection_of(root))[:3, 3]
+    assert moved == pytest.approx(in_capture(root, (1.0, 0.0, 0.0)), abs=1e-4)
     assert blender_scene.recolor_of(collection_of(root)).hue == 0.1
 
 
@@ -1435,7 +1550,8 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
     assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
     table = read_vertices(tmp_path / "all.ply")
     assert set(table["object_id"].tolist()) == {0, 2, HUGE}
-    assert np.array(entry(root, 2).transform)[0, 3] == pytest.approx(1.0, abs=1e-4)
+    moved = np.array(entry(root, 2).transform)[:3, 3]
+    assert moved == pytest.approx(in_capture(root, (1.0, 0.0, 0.0)), abs=1e-4)
     assert bpy.ops.objectgs.import_splats(filepath=str(tmp_path / "all.ply"), folder=str(tmp_path / "again")) == {
         "FINISHED"
     }
@@ -1543,7 +1659,9 @@ def test_rotation_by_right_angle(root):
     pivot = part(root, "object_parent")
     pivot.rotation_euler.z = math.pi / 2
     place = blender_scene.placement_of(root, collection_of(root))
-    assert place[:3, :3] == pytest.approx(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), abs=1e-6)
+    turn = np.array(kinds.parent_of(root).matrix_world)[:3, :3]
+    wanted = turn.T @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ turn
+    assert place[:3, :3] == pytest.approx(wanted, abs=1e-6)
     middle = np.array(pivot["objectgs_center"]) + ORIGIN
     assert place[:3, :3] @ middle + place[:3, 3] == pytest.approx(middle, abs=1e-4)
 

@@ -220,10 +220,11 @@ def test_whole_scene_mesh_does_not_hide_the_rest(root):
     assert 0 not in shoot(root).frames[0].samples[0].objects
 
 
-def test_objects_that_grow_from_nothing_are_omitted_until_then(root, tmp_path):
+@pytest.mark.parametrize("others", [0.0, 1.0], ids=["point", "disc"])
+def test_objects_that_grow_from_nothing_are_omitted_until_then(root, tmp_path, others):
     pivot = ensure_pivot(root, 1)
     for frame, size in ((1, 0.0), (3, 1.0)):
-        pivot.scale = [size] * 3
+        pivot.scale = size, max(size, others), max(size, others)
         pivot.keyframe_insert("scale", frame=frame)
     bpy.context.scene.frame_set(1)
     shot = shoot(root, (1, 2, 3))

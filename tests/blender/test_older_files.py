@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from objectgs.backend.shared.color.recolor import Recolor
 from objectgs.backend.shared.formats.splat_ply import UNOBSERVED
+from objectgs.backend.shared.reconstruction.objects import read_objects
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import older_files
 from objectgs.objectgs_addon.scene import carrier, kinds, object_collection
-from objectgs.objectgs_addon.scene.edits import fills, recolor
+from objectgs.objectgs_addon.scene.edits import axes, fills, recolor
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
 from objectgs.objectgs_addon.state import object_edits
@@ -191,3 +192,49 @@ def test_a_file_that_an_earlier_version_saved_opens_and_is_updated(extension, tm
     assert [row.name for row in (mug, bottle, ring)] == ["mug", "bottle", "ring"]
     assert ring.removed and ring.fill and mug.hue == pytest.approx(0.3)
     assert not former_names()
+
+
+@pytest.mark.skipif(bpy.app.version < (4, 2, 0), reason="is older than the Blender that saved the file, 4.2")
+def test_pivots_of_an_earlier_version_keep_their_axes_beside_new_ones(extension, tmp_path):
+    zipfile.ZipFile(EARLIER).extractall(tmp_path)
+    folder = tmp_path / "rec"
+    bpy.ops.wm.open_mainfile(filepath=str(folder / "objectgs.blend"))
+    root = bpy.context.scene.objectgs.active
+    root[kinds.FOLDER] = str(folder)
+    collections = blender_scene.object_collections(root)
+    pivots = {i: kinds.part_of(collection, "object_parent") for i, collection in collections.items()}
+
+    def world(object_id):
+        return np.array(blender_scene.matrix_to_world(splats_of(root, object_id)))
+
+    kinds.parent_of(root).rotation_euler = -1.1, 0.2, 0.3
+    bpy.context.view_layer.update()
+    before = {i: world(i) for i in collections}
+    assert not any(axes.AXES in pivot for pivot in pivots.values())
+    center = tuple(pivots[1].location)
+    bpy.data.objects.remove(pivots.pop(4))
+    blender_scene.show_result(root, folder)
+    pivots[4] = kinds.part_of(collections[4], "object_parent")
+    assert axes.AXES in pivots[4] and axes.AXES not in pivots[1]
+    assert all(world(i) == pytest.approx(matrix, abs=1e-5) for i, matrix in before.items())
+    assert [i for i in collections if blender_scene.is_moved(root, collections[i])] == [2]
+
+    copies = {i: blender_scene.duplicate(root, collections[i]) for i in (1, 4)}
+    turn = np.array(kinds.parent_of(root).matrix_world)[:3, :3]
+    for copy in copies.values():
+        kinds.part_of(copy, "object_parent").location.x += 1.0
+    blender_scene.store_placements(root)
+    entries = {entry.id: entry for entry in read_objects(folder / "objects.json")}
+    shifts = [np.array(entries[i].copies[0])[:3, 3] for i in (1, 4)]
+    assert entries[2].transform[0] == (1.0, 0.0, 0.0, 0.2)
+    assert shifts[0] == pytest.approx((1.0, 0.0, 0.0), abs=1e-5), "in the axes of the capture"
+    assert turn @ shifts[1] == pytest.approx((1.0, 0.0, 0.0), abs=1e-5), "in the axes of the world"
+
+    pivots[1].location.x += 1.0
+    assert blender_scene.placement_of(root, collections[1])[:3, 3] == pytest.approx((1.0, 0.0, 0.0), abs=1e-5)
+    blender_scene.scale_to_distance(root, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0)
+    assert axes.AXES not in pivots[1] and tuple(pivots[4].matrix_basis.to_scale()) == pytest.approx((1.0,) * 3)
+    blender_scene.reset_placement(root, collections[1])
+    assert tuple(pivots[1].location) == pytest.approx(center, abs=1e-6)
+    doubled = np.diag((2.0, 2.0, 2.0, 1.0))
+    assert all(world(i) == pytest.approx(doubled @ matrix, abs=1e-5) for i, matrix in before.items())

@@ -25,7 +25,8 @@ from ..kinds import (
     parts_of,
 )
 from ..object_collection import NAME
-from .placement import PLACEMENT, matrix_to_world, pivot_above, placement_of, set_local_map, set_placement
+from .axes import attach, part_axes, set_local_map
+from .placement import PLACEMENT, matrix_to_world, pivot_above, placement_of, set_placement
 
 DUPLICATES = "objectgs_copies"
 """Custom property of an object's collection: placements of its duplicates at the last sync with objects.json (JSON)."""
@@ -98,8 +99,7 @@ def adopt_blender_duplicates(root: bpy.types.Collection) -> None:
             obj.parent = pivot
             set_local_map(obj, own)
             place = placement_of(root, copy)
-            obj.matrix_parent_inverse.identity()
-            obj.matrix_basis.identity()
+            set_local_map(obj, part_axes(pivot))
             set_placement(root, copy, place)
 
 
@@ -141,7 +141,7 @@ def _follow(source: Any, copy: Any) -> None:
         twin = there.pop(_key(obj), None)
         if twin is None:
             twin = obj.copy()
-            twin.parent = pivot
+            attach(twin, pivot)
             if pivot is not None and pivot_above(obj) not in source.objects[:]:
                 _move_beside(twin, obj, source, copy)
             copy.objects.link(twin)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
-from mathutils import Matrix
 
 from ....backend.shared.errors import InputError
 from ....backend.shared.reconstruction.objects import is_singular
@@ -13,12 +12,10 @@ from .. import carrier
 from ..capture import origin_of
 from ..kinds import ANCHORS, MESH, OBJECT_PARENT, SPLATS, kind_of, parent_of, part_of, parts_of, require_parent
 from ..object_collection import center_of
+from .axes import map_to, part_axes, set_local_map
 
 PLACEMENT = "objectgs_place"
 """Custom property of a collection: its placement in objects.json and its `local_placement` at the last sync (JSON)."""
-
-EXACT = 1e-5
-"""Largest relative error of a map as location, rotation and scale; beyond it, the parent inverse stores the rest."""
 
 ROUNDING = 1e-6
 """Largest difference of two transforms that counts as rounding, relative to their largest number or 1."""
@@ -33,7 +30,9 @@ def local_placement(root: bpy.types.Collection, collection: bpy.types.Collection
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return None
-    return _map(pivot, parent) @ _own(collection, pivot)
+    local = map_to(pivot, parent) @ _own(collection, pivot)
+    rest = _shift(_rest(pivot))
+    return rest if is_rounding(pivot, local - rest) else local
 
 
 def placement_of(root: bpy.types.Collection, collection: bpy.types.Collection) -> np.ndarray | None:
@@ -62,13 +61,13 @@ def set_placement(root: bpy.types.Collection, collection: bpy.types.Collection, 
     pivot, parent = part_of(collection, OBJECT_PARENT), parent_of(root)
     if pivot is None or parent is None:
         return
-    apart = {part: _map(part, pivot) for part in _own_parts(collection, pivot) if pivot_above(part) != pivot}
+    apart = {part: map_to(part, pivot) for part in _own_parts(collection, pivot) if pivot_above(part) != pivot}
     moved = np.eye(4) if place is None else about(np.asarray(place, np.float64), -origin_of(root))
     wanted = moved @ _shift(_rest(pivot)) @ np.linalg.inv(_own(collection, pivot))
     if pivot.parent is not None:
-        wanted = np.linalg.inv(_map(pivot.parent, parent)) @ wanted
+        wanted = np.linalg.inv(map_to(pivot.parent, parent)) @ wanted
     else:
-        wanted = _map(parent, None) @ wanted
+        wanted = map_to(parent, None) @ wanted
     set_local_map(pivot, wanted)
     for part, own in apart.items():
         world = matrix_to_world(pivot) @ own
@@ -80,15 +79,8 @@ def reset_placement(root: bpy.types.Collection, collection: bpy.types.Collection
     pivot = part_of(collection, OBJECT_PARENT)
     for part in _own_parts(collection, pivot) if pivot is not None else ():
         part.parent = pivot
-        set_local_map(part, np.linalg.inv(carrier.applied_map(part.data)))
+        set_local_map(part, part_axes(pivot) @ np.linalg.inv(carrier.applied_map(part.data)))
     set_placement(root, collection, None)
-
-
-def attach(part: bpy.types.Object, pivot: bpy.types.Object | None) -> None:
-    """Give a part another pivot, and keep how the user has moved it relative to the previous one."""
-    if kind_of(part.parent) != OBJECT_PARENT:
-        set_local_map(part, np.eye(4))
-    part.parent = pivot
 
 
 def move_to_transforms(mesh: bpy.types.Mesh) -> None:
@@ -100,7 +92,7 @@ def move_to_transforms(mesh: bpy.types.Mesh) -> None:
     if np.array_equal(applied, np.eye(4)):
         return
     for obj in [obj for obj in bpy.data.objects if obj.data == mesh]:
-        set_local_map(obj, _map(obj, obj.parent) @ applied)
+        set_local_map(obj, map_to(obj, obj.parent) @ applied)
 
 
 def take_back(mesh: bpy.types.Mesh) -> None:
@@ -121,12 +113,12 @@ def take_back(mesh: bpy.types.Mesh) -> None:
 
 def matrix_to_world(obj: bpy.types.Object) -> np.ndarray:
     """Return the map from local to world coordinates of a Blender object, also if it is hidden, (4, 4) float64."""
-    return _map(obj, None)
+    return map_to(obj, None)
 
 
 def matrix_to_capture(root: bpy.types.Collection, obj: bpy.types.Object) -> np.ndarray:
     """Return the map from local to capture coordinates of a Blender object, (4, 4) float64."""
-    return _shift(origin_of(root)) @ _map(obj, parent_of(root))
+    return _shift(origin_of(root)) @ map_to(obj, parent_of(root))
 
 
 def matrix_of_root(root: bpy.types.Collection) -> np.ndarray:
@@ -155,21 +147,22 @@ def rest_placement(collection: bpy.types.Collection) -> np.ndarray:
 
 
 def _own(collection: bpy.types.Collection, pivot: bpy.types.Object) -> np.ndarray:
-    """Return the transform of the splats, or else of the mesh, relative to the pivot; exactly identity if not moved.
+    """Return the map of the splats, or else of the mesh, relative to the pivot; exactly `part_axes` if not moved.
 
     What Blender's operators have applied to the vertices counts as part of it.
     """
+    rest = part_axes(pivot)
     for kind in (SPLATS, MESH):
         part = part_of(collection, kind)
         # A mesh of which the user has cleared or changed the parent alone serves another purpose.
         if part is not None and (kind == SPLATS or part.parent in (pivot, pivot.parent)):
-            own = _map(part, pivot) @ carrier.applied_map(part.data)
-            if np.array_equal(own, np.eye(4)):
+            own = map_to(part, pivot) @ carrier.applied_map(part.data)
+            if np.array_equal(own, rest):
                 continue
             base = matrix_to_world(pivot)
-            if np.abs(base @ own - base).max() > ROUNDING * np.abs(base).max():
+            if np.abs(base @ (own - rest)).max() > ROUNDING * np.abs(base @ rest).max():
                 return own
-    return np.eye(4)
+    return rest
 
 
 def _own_parts(collection: bpy.types.Collection, pivot: bpy.types.Object) -> list[bpy.types.Object]:
@@ -187,37 +180,12 @@ def pivot_above(part: bpy.types.Object) -> bpy.types.Object | None:
     return above
 
 
-def set_local_map(obj: bpy.types.Object, wanted: np.ndarray) -> None:
-    """Set the map from an object's local coordinates to those of its parent or, without one, the world, (4, 4)."""
-    needed = Matrix(wanted.tolist())
-    location, rotation, scale = needed.decompose()
-    simple = Matrix.LocRotScale(location, rotation, scale)
-    size = np.abs(wanted[:3, :3]).max()
-    obj.matrix_parent_inverse.identity()
-    obj.matrix_basis = simple
-    if np.abs(np.array(simple) - wanted)[:3, :3].max() > EXACT * size and obj.parent is not None:
-        # The map contains shear, such as a nonuniform scale after a rotation.
-        obj.matrix_parent_inverse = needed @ simple.inverted()
-
-
-def _map(obj: bpy.types.Object, above: bpy.types.Object | None) -> np.ndarray:
-    """Return the map from local coordinates of `obj` to those of `above` or, if None, the world, (4, 4) float64.
-
-    It is computed from the local transforms, since Blender does not evaluate hidden objects. Only constraints and
-    parent types other than Object require Blender's evaluated matrix.
-    """
-    matrix, at = np.eye(4), obj
-    while at is not None and at != above:
-        if at.constraints or (at.parent is not None and at.parent_type != "OBJECT"):
-            matrix, at = np.array(at.matrix_world) @ matrix, None
-            break
-        basis = np.array(at.matrix_basis, np.float64)
-        if at.parent is not None:
-            basis = np.array(at.matrix_parent_inverse, np.float64) @ basis
-        matrix, at = basis @ matrix, at.parent
-    if at is None and above is not None:
-        return np.linalg.inv(_map(above, None)) @ matrix
-    return matrix
+def is_rounding(pivot: bpy.types.Object, difference: np.ndarray) -> bool:
+    """Return whether two maps of `local_placement` differ, by (4, 4), no more than single precision explains."""
+    shift = np.array(pivot.matrix_parent_inverse.translation)
+    size = max(1.0, np.abs(_rest(pivot)).max(), np.abs(shift).max())
+    turned, moved = np.abs(difference[:3, :3]).max(), np.abs(difference[:3, 3]).max()
+    return bool(turned <= 2.0 * ROUNDING and moved <= ROUNDING * size)
 
 
 def _rest(pivot: bpy.types.Object) -> np.ndarray:

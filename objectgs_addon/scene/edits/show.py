@@ -24,7 +24,16 @@ from ..object_display import Objects
 from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
 from .fills import show_fills
 from .floaters import hide_floaters
-from .placement import PLACEMENT, ROUNDING, about, local_placement, placement_of, rest_placement, set_placement
+from .placement import (
+    PLACEMENT,
+    ROUNDING,
+    about,
+    is_rounding,
+    local_placement,
+    placement_of,
+    rest_placement,
+    set_placement,
+)
 from .recolor import recolor_of, set_recolor
 from .recover import recover_parts
 
@@ -238,7 +247,7 @@ def _place(root: bpy.types.Collection, collection: bpy.types.Collection) -> list
     if local is None:
         return None
     agreed = json.loads(collection[PLACEMENT]) if PLACEMENT in collection else None
-    if agreed is not None and agreed["local"] == local.tolist():
+    if agreed is not None and is_rounding(part_of(collection, OBJECT_PARENT), local - np.array(agreed["local"])):
         return agreed["stored"]
     place = placement_of(root, collection).tolist()
     return None if _same(root, [None], [place]) else place

@@ -14,7 +14,8 @@ from ....backend.shared.formats.mesh_ply import Mesh, read_mesh
 from ....backend.shared.formats.splat_ply import UNOBSERVED
 from .. import carrier
 from ..capture import origin_of
-from ..edits.placement import attach, move_to_transforms
+from ..edits.axes import attach, put_below
+from ..edits.placement import move_to_transforms
 from ..kinds import ANCHORS, MESH, MESH_COLORS, MESH_KEY, OBJECT_PARENT, SPLATS, adopt, mark, parent_of, part_of
 from ..object_collection import NAME, center_of, ensure_pivot, new_collection, textures_of
 from ..object_display import Objects
@@ -91,7 +92,7 @@ class MeshImporter:
             center = center_of(pivot)
         if obj is None:
             obj = self._new(listed, target, collection)
-            obj.parent = pivot
+            put_below(obj, pivot)
         elif not in_place:
             self.unlink(obj)
             collection.objects.link(obj)
