@@ -571,6 +571,38 @@ def test_export_places_keyframed_meshes(root, tmp_path):
     assert found.animation_data is None and mesh.animation_data is not None
 
 
+def corner_normals(obj) -> np.ndarray:
+    """Return positions and normals (n, 6) of a mesh's corners in the world, rounded and sorted."""
+    turn = np.array(obj.matrix_world)[:3, :3]
+    places = coordinates(obj)[[loop.vertex_index for loop in obj.data.loops]]
+    normals = np.array([loop.normal for loop in obj.data.loops]) @ turn.T
+    return np.array(sorted({tuple(np.round(row, 3)) for row in np.hstack([places, normals])}))
+
+
+def test_exported_objects_have_their_rotation_and_no_other(root, tmp_path):
+    """That of the capture is part of the vertices, which duplicates share."""
+    mesh, pivot = mesh_of(root, 1), parts(root, 1, "object_parent")[0]
+    copy = blender_scene.duplicate(root, blender_scene.object_collections(root)[1])
+    twin = kinds.part_of(copy, "object_parent")
+    twin.location.x += 5.0
+    twin.rotation_euler.z = 0.5
+    bpy.context.view_layer.update()
+    count = len(bpy.data.meshes)
+    mesh_export.export(root, tmp_path / "mug.glb", "glb", [1], False, False)
+    assert len(bpy.data.meshes) == count
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=str(tmp_path / "mug.glb"))
+    bpy.context.view_layer.update()
+    found = sorted(
+        (obj for obj in set(bpy.data.objects) - before if obj.type == "MESH"), key=lambda obj: obj.location.x
+    )
+    assert len(found) == 2 and found[0].data == found[1].data
+    for obj, source in zip(found, (pivot, twin), strict=True):
+        assert np.array(obj.matrix_world) == pytest.approx(np.array(source.matrix_world), abs=1e-5)
+    assert np.array(found[0].matrix_world)[:3, :3] == pytest.approx(np.eye(3), abs=1e-5)
+    assert corner_normals(found[0]) == pytest.approx(corner_normals(mesh), abs=2e-3)
+
+
 def test_export_keeps_shear(root, tmp_path):
     mesh, pivot = mesh_of(root, 1), parts(root, 1, "object_parent")[0]
     pivot.rotation_euler.z = 0.6

@@ -17,6 +17,7 @@ from ....backend.shared.formats.file_names import distinct_stems
 from ....backend.shared.reconstruction.folder import Reconstruction
 from ... import scene
 from ...blender.quiet import quiet
+from ..edits.axes import part_axes
 from ..object_collection import our_materials
 from .shading import lit
 
@@ -160,7 +161,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
     ]
     stage = bpy.data.scenes.new("ObjectGS export")
     made: list[bpy.types.Object] = []
-    sheared: list[bpy.types.Mesh] = []
+    turned: dict[tuple, bpy.types.Mesh] = {}
     copies: dict[bpy.types.Material, tuple[bpy.types.Material, list[bpy.types.Image]]] = {}
     names: dict[bpy.types.ID, str] = {}
     try:
@@ -174,17 +175,23 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                 obj.constraints.clear()
                 # Exporters evaluate other frames.
                 obj.animation_data_clear()
-                obj.matrix_basis = Matrix(place.tolist())
-                difference = np.array(obj.matrix_basis)[:3, :3] - place[:3, :3]
-                if np.abs(difference).max() > _SHEARED * np.abs(place[:3, :3]).max():
+                # An object that was not turned is not turned in other programs either.
+                baked = np.eye(4) if in_capture else part_axes(mesh.parent)
+                wanted = place @ np.linalg.inv(baked)
+                obj.matrix_basis = Matrix(wanted.tolist())
+                difference = np.array(obj.matrix_basis)[:3, :3] - wanted[:3, :3]
+                if np.abs(difference).max() > _SHEARED * np.abs(wanted[:3, :3]).max():
                     # Location, rotation and scale cannot express shear.
-                    obj.data = mesh.data.copy()
-                    sheared.append(obj.data)
-                    _take_name(obj.data, mesh.data, names)
-                    obj.data.transform(Matrix(place.tolist()), shape_keys=True)
-                    if np.linalg.det(place[:3, :3]) < 0:
-                        obj.data.flip_normals()
-                    obj.matrix_basis = Matrix()
+                    baked, obj.matrix_basis = place, Matrix()
+                if not np.array_equal(baked, np.eye(4)):
+                    key = mesh.data, baked.tobytes()
+                    if key not in turned:
+                        turned[key] = mesh.data.copy()
+                        _take_name(turned[key], mesh.data, names)
+                        turned[key].transform(Matrix(baked.tolist()), shape_keys=True)
+                        if np.linalg.det(baked[:3, :3]) < 0:
+                            turned[key].flip_normals()
+                    obj.data = turned[key]
                 obj.hide_viewport = obj.hide_render = False
                 stage.collection.objects.link(obj)
                 recolor, ours = scene.recolor_of(collection), our_materials(mesh)
@@ -208,7 +215,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
             region.view_perspective = perspective
         for obj in made:
             bpy.data.objects.remove(obj)
-        for data in sheared:
+        for data in turned.values():
             bpy.data.meshes.remove(data)
         for copy, images in copies.values():
             bpy.data.materials.remove(copy)
