@@ -270,6 +270,7 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
             view.hide_capture(root)
         scene.set_up_render(target, root)
         view.hide_relationship_lines()
+        view.widen_clipping(root)
         has_meshes = bool(scene.object_meshes(root))
         if has_meshes or scene.scene_meshes(root):
             apart.add_even_light(target)

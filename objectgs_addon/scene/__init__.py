@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """A reconstruction folder shown as collections, cameras, points and splats in Blender; contains no operators."""
 
-from .cameras import use_camera
+from .cameras import use_camera, widen_clipping
 from .capture import capture_to_world, show_capture, warnings_of
 from .carrier import require_object_mode
 from .edits.crop_box import add_crop_box, box_of, crop_box_of
@@ -163,6 +163,7 @@ __all__ = [
     "update_floaters",
     "use_camera",
     "warnings_of",
+    "widen_clipping",
     "with_own_textures",
     "write_catalog",
 ]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Blender cameras that exactly match the pinhole cameras in cameras.json."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import bpy
@@ -55,10 +55,12 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
     return _warnings(cameras.views)
 
 
-def widen_clipping(root: bpy.types.Collection, cameras: Sequence[bpy.types.Object] | None = None) -> None:
-    """Let cameras of a reconstruction's capture, by default all, see from 1/200 of the scene's size to ten times that.
+def widen_clipping(
+    root: bpy.types.Collection, views: Iterable[bpy.types.Camera | bpy.types.SpaceView3D] | None = None
+) -> None:
+    """Let cameras or viewports see from 1/200 of the size of a reconstruction's capture to ten times that.
 
-    Clip distances that are wider are kept.
+    By default, they are all cameras of the capture. Clip distances that are wider are kept.
     """
     capture, parent = capture_of(root), parent_of(root)
     if capture is None or parent is None:
@@ -72,12 +74,12 @@ def widen_clipping(root: bpy.types.Collection, cameras: Sequence[bpy.types.Objec
     if not len(every):
         return
     reach = float(np.linalg.norm(np.ptp(every, axis=0)) * max(map(abs, parent.matrix_world.to_scale())))
-    for camera in [part for part in capture.objects if kind_of(part) == CAMERA] if cameras is None else cameras:
-        data = camera.data
-        if data is None or data.library is not None:
-            continue
-        data.clip_start = min(data.clip_start, reach * _NEAREST)
-        data.clip_end = max(data.clip_end, reach * _FARTHEST)
+    if views is None:
+        cameras = (part.data for part in capture.objects if kind_of(part) == CAMERA)
+        views = [camera for camera in cameras if camera is not None and camera.library is None]
+    for view in views:
+        view.clip_start = min(view.clip_start, reach * _NEAREST)
+        view.clip_end = max(view.clip_end, reach * _FARTHEST)
 
 
 def use_camera(scene: bpy.types.Scene, camera: bpy.types.Object) -> None:

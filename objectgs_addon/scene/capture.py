@@ -108,7 +108,7 @@ def show_capture(
     if is_new or not any(root in other.collection.children_recursive for other in bpy.data.scenes):
         scene.collection.children.link(root)
     ours = [obj for obj in capture.objects if kind_of(obj) == CAMERA]
-    widen_clipping(root, [camera for camera in ours if camera.session_uid not in before])
+    widen_clipping(root, [camera.data for camera in ours if camera.session_uid not in before])
     if ours and scene.camera is None:
         use_camera(scene, min(ours, key=lambda obj: obj["objectgs_image"]))
     elif scene.camera in ours and follows_photo:

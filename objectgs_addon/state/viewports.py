@@ -16,6 +16,7 @@ from . import object_list, visibility
 
 def show(root: bpy.types.Collection) -> None:
     """Show the scene as its first camera sees it in all 3D viewports, and color attributes in Solid mode."""
+    widen_clipping(root)
     for window in bpy.context.window_manager.windows:
         if root not in window.scene.collection.children_recursive:
             continue
@@ -134,6 +135,11 @@ def show_first(owner: bpy.types.Scene, folder: Path) -> bpy.types.Collection:
     if not related:
         hide_relationship_lines()
     return root
+
+
+def widen_clipping(root: bpy.types.Collection) -> None:
+    """Let all 3D viewports show a reconstruction of any size."""
+    scene.widen_clipping(root, _spaces())
 
 
 def hide_relationship_lines() -> None:

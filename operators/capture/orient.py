@@ -9,6 +9,7 @@ from mathutils import Vector
 
 from ...objectgs_addon import scene
 from ...objectgs_addon.picking import point_picker
+from ...objectgs_addon.state import viewports
 from ..common import need
 from ..common.reporting import reports_errors
 
@@ -121,7 +122,9 @@ class SetDistance(_PicksPoints, bpy.types.Operator):
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> None:
-        scene.scale_to_distance(need.active_root(context), *self._points(), self.distance)
+        root = need.active_root(context)
+        scene.scale_to_distance(root, *self._points(), self.distance)
+        viewports.widen_clipping(root)
 
 
 CLASSES = (SetGround, SetDistance)

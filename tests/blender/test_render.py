@@ -316,3 +316,16 @@ def test_lines_to_parents_are_hidden_unless_the_user_has_some(fresh, folder):
         bpy.data.objects.remove(obj)
     viewports.show_first(bpy.context.scene, folder)
     assert lines() == {False}
+
+
+@pytest.mark.parametrize("size", [2000.0, 1e-3])
+def test_viewports_see_the_whole_of_a_large_or_tiny_scene(registered, folder, size):
+    bpy.ops.wm.read_factory_settings()
+    write_cameras(folder, [look_at((size * np.cos(angle), size * np.sin(angle), size / 3)) for angle in range(6)])
+    bpy.ops.objectgs.open_reconstruction(directory=str(folder))
+    areas = [area for screen in bpy.data.screens for area in screen.areas if area.type == "VIEW_3D"]
+    spaces = [area.spaces.active for area in areas]
+    assert spaces and all(space.clip_start < 0.02 * size and space.clip_end > 5 * size for space in spaces)
+    bpy.ops.objectgs.set_distance(points=(0, 0, 0, 1, 0, 0), distance=1e4)
+    assert all(space.clip_end > 5e4 * size for space in spaces)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
