@@ -131,6 +131,11 @@ class Renderer:
         read.dimensions = width * height * 4
         return np.array(read, np.float32).reshape(height, width, 4)[::-1]
 
+    @property
+    def has_splats(self) -> bool:
+        """Whether splats are in GPU memory."""
+        return self._pool is not None
+
     def free(self) -> None:
         """Free GPU memory."""
         self._target = self._pool = self._entries = self._order = None

@@ -2,8 +2,8 @@
 """Splats of mesh carriers as arrays, for drawing and picking.
 
 The arrays are cached by the session UID of the mesh, never by the mesh itself. They are dropped when another file is
-opened. When the mesh is updated, and on undo and redo, they are read again, and kept if they are the same as before, so
-that what is made of them need not be made again.
+opened, or when no object has the mesh any more. When the mesh is updated, and on undo and redo, they are read again,
+and kept if they are the same as before, so that what is made of them need not be made again.
 """
 
 from __future__ import annotations
@@ -168,18 +168,23 @@ def _read(mesh: bpy.types.Mesh) -> SplatArrays:
 
 
 def _forget(*_: Any) -> None:
-    _held.clear()
-    _before.clear()
-    _selected.clear()
+    for known in (_held, _before, _visible_labels, _selected):
+        known.clear()
+
+
+def _forget_unused() -> None:
+    """Drop what is known of meshes that no object has; Blender keeps such meshes until the file is saved."""
+    used = {mesh.session_uid for mesh in bpy.data.meshes if mesh.users}
+    for known in (_held, _before, _visible_labels, _selected):
+        for uid in known.keys() - used:
+            del known[uid]
 
 
 def _undone(*_: Any) -> None:
-    there = {mesh.session_uid for mesh in bpy.data.meshes}
-    held = {**_before, **_held}
-    _before.clear()
-    _before.update((uid, arrays) for uid, arrays in held.items() if uid in there)
+    _before.update(_held)
     _held.clear()
     _selected.clear()
+    _forget_unused()
 
 
 def _changed(_scene: Any, depsgraph: Any) -> None:
@@ -187,6 +192,8 @@ def _changed(_scene: Any, depsgraph: Any) -> None:
     for update in depsgraph.updates:
         if update.is_updated_geometry and isinstance(update.id, bpy.types.Mesh):
             splats_changed(update.id.original)
+    if _held or _before:
+        _forget_unused()
 
 
 _forget, _undone, _changed = (bpy.app.handlers.persistent(handler) for handler in (_forget, _undone, _changed))

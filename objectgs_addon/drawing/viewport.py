@@ -66,8 +66,10 @@ def picture(context_scene: Any, view_layer: bpy.types.ViewLayer, view: View, pro
 
 def _draw() -> None:
     context = bpy.context
-    is_on = context.scene.objectgs.draw_splats and context.region_data is not None
-    if not is_on or _failure is not None or not is_in_file():
+    if context.region_data is None or _failure is not None or not is_in_file():
+        return
+    if not context.scene.objectgs.draw_splats:
+        _free_unused()
         return
     try:
         renderer()
@@ -98,8 +100,10 @@ def _draw_splats(context: bpy.types.Context) -> None:
     parts = gather.placed_parts(context.view_layer, space)
     objs = gather.gather(parts, properties.colors, _pointed_at, space.overlay.show_overlays)
     meshes = gather.meshes_of(_pointed_at, context.view_layer, space)
-    if not objs and not meshes:
-        return
+    if not objs:
+        _free_unused()
+        if not meshes:
+            return
     target = gpu.state.active_framebuffer_get()
     x, y, width, height = target.viewport_get()
     projection = np.array(region.window_matrix)
@@ -124,6 +128,14 @@ def _draw_splats(context: bpy.types.Context) -> None:
     if is_drawn or meshes:
         theme, scale = context.preferences.themes[0].view_3d, context.preferences.system.ui_scale
         renderer().composite(tuple(srgb.decode(theme.object_active[:3]).tolist()), OUTLINE * scale)
+
+
+def _free_unused() -> None:
+    """Free GPU memory where no scene has splats to draw any more; another viewport may draw those of its scene."""
+    if _renderer is not None and _renderer.has_splats:
+        drawn = (scene for scene in bpy.data.scenes if scene.objectgs.draw_splats)
+        if not any(gather.carriers(scene) for scene in drawn):
+            _renderer.free()
 
 
 def point_at(collection: bpy.types.Collection) -> None:

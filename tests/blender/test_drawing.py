@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Input of the viewport drawing: splat arrays, their order and placement, and objects with a hidden preview."""
 
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,6 +53,28 @@ def evaluated_size(obj) -> int:
             for block in (geometry.mesh, geometry.pointcloud)
         )
     return len(shape.data.vertices)
+
+
+def test_splats_that_no_object_has_are_dropped_from_memory(root, registered, monkeypatch):
+    """Blender keeps the mesh of a deleted object; the textures are freed where no scene has anything to draw."""
+    owner = bpy.context.scene
+    arrays = [weakref.ref(splat_arrays.arrays_of(each.data)) for each in gather.carriers(owner)]
+    bpy.data.objects.remove(part(root, 2))
+    bpy.context.view_layer.update()
+    assert len(bpy.data.meshes) >= len(arrays) and sum(each() is not None for each in arrays) == len(arrays) - 1
+    freed = []
+    textures = SimpleNamespace(has_splats=True, free=lambda: freed.append(True))
+    monkeypatch.setattr(viewport, "_renderer", textures)
+    context = SimpleNamespace(scene=owner, region_data=True)
+    monkeypatch.setattr(viewport, "bpy", SimpleNamespace(context=context, data=bpy.data))
+    other = bpy.data.scenes.new("other")
+    other.collection.children.link(root)
+    owner.objectgs.draw_splats, other.objectgs.draw_splats = False, True
+    viewport._draw()
+    assert not freed, "another scene draws them"
+    other.objectgs.draw_splats = False
+    viewport._draw()
+    assert freed == [True]
 
 
 def test_splat_arrays_match_file_and_follow_mesh_changes(root):
