@@ -116,7 +116,7 @@ def new_capture(sources: Sequence[Path]) -> Path:
 
 def backend_python() -> Path | None:
     """Return the backend's Python: the user's choice, else that of the environment; None if it is not usable."""
-    chosen = _chosen_python()
+    chosen = chosen_python()
     if chosen is not None:
         return chosen if is_file(chosen) else None
     state = environment.inspect(environment_folder())
@@ -125,12 +125,12 @@ def backend_python() -> Path | None:
 
 def may_use_gpu() -> bool:
     """Return whether the backend's environment was set up for a GPU; that of another Python is not known."""
-    return _chosen_python() is None and environment.inspect(environment_folder()).device == "cuda"
+    return chosen_python() is None and environment.inspect(environment_folder()).device == "cuda"
 
 
 def backend_sentence() -> str:
     """Describe the backend in a sentence: its location, or why it cannot run and what to do."""
-    chosen = _chosen_python()
+    chosen = chosen_python()
     if chosen is None:
         return environment.inspect(environment_folder(), online_access.remedy()).sentence
     if is_file(chosen):
@@ -138,13 +138,16 @@ def backend_sentence() -> str:
     return f"The backend's Python {chosen} does not exist; choose another, or clear the field."
 
 
-def is_chosen_missing() -> bool:
-    """Return whether the user has chosen a Python for the backend that does not exist."""
-    chosen = _chosen_python()
-    return chosen is not None and not is_file(chosen)
+def how_to_set_up() -> str:
+    """Return what the user does to have the backend set up, which would not be used beside a chosen Python."""
+    if os.environ.get("OBJECTGS_PYTHON"):
+        return "unset OBJECTGS_PYTHON, start Blender again and set the backend up"
+    if chosen_python() is not None:
+        return "clear Backend Python in the preferences of ObjectGS and set the backend up"
+    return "set it up again"
 
 
-def _chosen_python() -> Path | None:
+def chosen_python() -> Path | None:
     """Return the Python chosen by the user, which may be missing, or None."""
     chosen = os.environ.get("OBJECTGS_PYTHON") or (preferences().backend_python if preferences() else "")
     return Path(bpy.path.abspath(chosen)) if chosen else None
@@ -167,7 +170,7 @@ def backend_job(title: str, kind: str, folder: Path | None, *arguments: str) -> 
     """
     python = backend_python()
     assert python is not None
-    silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or set it up again."
+    silent = f"{python} cannot run the backend; choose a Python {VERSIONS} that has its packages, or {how_to_set_up()}."
     return Job(
         title=title,
         kind=kind,

@@ -63,8 +63,8 @@ class SetUpBackend(bpy.types.Operator):
 
     @reports_errors
     def execute(self, context: bpy.types.Context) -> set[str]:
-        if locations.is_chosen_missing():
-            raise InputError(f"{locations.backend_sentence()} It is Backend Python in the preferences of ObjectGS")
+        if (chosen := locations.chosen_python()) is not None:
+            raise InputError(f"The backend would go on using {chosen}; {locations.how_to_set_up()}")
         # Its process uses the present environment.
         pointing.stop()
         preferences = locations.preferences()

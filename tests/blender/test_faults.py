@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from objectgs.objectgs_addon.process.jobs import Job, State
 from objectgs.objectgs_addon.running import background, handlers, results
 from objectgs.objectgs_addon.state import folder_trust, object_list
 from objectgs.objectgs_addon.state.folder_state import folder_state
+from objectgs.operators.setup import set_up_backend
 
 from .drawn import texts_of
 
@@ -223,6 +225,22 @@ def test_missing_python_is_reported(extension, shown, monkeypatch, tmp_path):
     assert f"{tmp_path / 'gone'} does not exist" in error_report(bpy.ops.objectgs.train)
 
 
+@pytest.mark.parametrize("chosen", ["variable", "preference"])
+def test_backend_that_would_not_be_used_is_not_set_up(extension, monkeypatch, chosen):
+    monkeypatch.setattr(set_up_backend, "_online", lambda _cls: True)
+    python, where = sys.executable, "unset OBJECTGS_PYTHON"
+    if chosen == "preference":
+        where = "clear Backend Python in the preferences"
+        preferences = SimpleNamespace(backend_python=python, base_python="", device="cpu")
+        monkeypatch.setattr(locations, "preferences", lambda: preferences)
+    else:
+        monkeypatch.setenv("OBJECTGS_PYTHON", python)
+    report = error_report(bpy.ops.objectgs.set_up_backend)
+    assert f"go on using {python}; {where}" in report and is_plain_sentence(report)
+    assert not background.queue.jobs
+    assert where in locations.backend_job("Train", "train", None, "train").if_silent
+
+
 @pytest.mark.parametrize(
     ("name", "program", "sentence"),
     [
@@ -337,6 +355,7 @@ def test_import_into_folder_in_use_is_rejected(extension, shown, folder, capture
     tick_until(lambda: running.is_finished)
     hold_lock = f"""
 from pathlib import Path
+from types import SimpleNamespace
 from backend.shared.reconstruction.lock import locked
 with locked(Path({str(folder)!r})):
     print("locked", flush=True)
