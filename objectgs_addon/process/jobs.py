@@ -411,7 +411,8 @@ class JobQueue:
     def stop_all(self, timeout: float) -> None:
         """Stop all jobs; the running job is killed if it has not saved and ended after `timeout` seconds."""
         for job in self.jobs:
-            job.stop()
+            if job.state is not State.STOPPING:  # A second call would end its saving.
+                job.stop()
         deadline = time.monotonic() + timeout
         running = self.running
         while running is not None and not running.is_finished:

@@ -221,6 +221,23 @@ def test_stop_all_waits_for_saving_and_kills_unresponsive_jobs(make):
         assert queue.running is None
 
 
+def test_stop_all_waits_for_a_job_that_was_stopped_long_ago(make, monkeypatch):
+    monkeypatch.setattr(jobs, "GRACE_SECONDS", 0.1)
+    job = make("""
+say("status", message="Training")
+while read_line() != "stop":
+    pass
+time.sleep(1.0)
+say("done", stopped=True, message="Saved")
+sys.exit(130)
+""")
+    queue = started(job)
+    job.stop()
+    time.sleep(0.3)
+    queue.stop_all(timeout=WAIT)
+    assert job.state is State.STOPPED and job.message == "Saved"
+
+
 @posix
 @pytest.mark.long
 def test_crash_reports_last_message(make):
