@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from .. import scene
+from .. import drawing, scene
 
 
 def select_object(context: bpy.types.Context, root: bpy.types.Collection, object_id: int, extend: bool = False) -> bool:
@@ -56,25 +56,19 @@ def select_nothing(context: bpy.types.Context) -> None:
 
 def selected_ids(context: bpy.types.Context, root: bpy.types.Collection) -> list[int]:
     """Return the IDs of the selected objects, the active one last."""
-    ids = []
-    parts = list(context.selected_objects)
+    parts = scene.only_of(root, context.selected_objects, context.scene)
     if context.active_object in parts:
         parts.remove(context.active_object)
         parts.append(context.active_object)
-    for part in parts:
-        if scene.root_of(part, context.scene) == root and (object_id := scene.object_id_of(part)) is not None:
-            if object_id in ids:
-                ids.remove(object_id)
-            ids.append(object_id)
-    return ids
+    ids = (scene.object_id_of(part) for part in reversed(parts))
+    return list(dict.fromkeys(object_id for object_id in ids if object_id is not None))[::-1]
 
 
 def selected_collections(context: bpy.types.Context, root: bpy.types.Collection) -> list:
     """Return the collections of the selected objects and duplicates."""
-    found = (
-        scene.collection_of(part) for part in context.selected_objects if scene.root_of(part, context.scene) == root
-    )
-    return list(dict.fromkeys(collection for collection in found if collection is not None))
+    parts = scene.only_of(root, context.selected_objects, context.scene)
+    collections = drawing.collections_by_part() if parts else {}
+    return list(dict.fromkeys(collections[part] for part in parts if part in collections))
 
 
 def select_shown_parts(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> None:

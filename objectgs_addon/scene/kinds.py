@@ -226,3 +226,18 @@ def root_of(block: bpy.types.ID, scene: bpy.types.Scene) -> bpy.types.Collection
         if above is not None and parent_of(root) == above:
             return root
     return next((root for root in roots if block in root.all_objects[:]), None)
+
+
+def only_of(
+    root: bpy.types.Collection, parts: Iterable[bpy.types.Object], scene: bpy.types.Scene
+) -> list[bpy.types.Object]:
+    """Return those of the add-on's Blender objects whose `root_of` in `scene` is `root`, without a search for each."""
+    inside, own = set(root.all_objects), parent_of(root)
+    others = {parent_of(each) for each in scene.collection.children_recursive if kind_of(each) == RECONSTRUCTION}
+    others -= {own, None}
+    found = ((part, parent_above(part)) for part in parts if kind_of(part) is not None)
+    return [
+        part
+        for part, above in found
+        if (above is not None and above == own) or (part in inside and above not in others)
+    ]

@@ -18,6 +18,8 @@ from objectgs.objectgs_addon.scene import carrier, kinds, result
 from objectgs.objectgs_addon.scene.points import read_points
 from objectgs.objectgs_addon.state import object_edits, object_list, visibility
 
+from .building import write_folder
+
 
 @pytest.fixture
 def root(fresh, trained, tmp_path):
@@ -107,6 +109,27 @@ def test_solo_toggles_visibility_of_others(root):
     assert [i for i, layer in layers.items() if not layer.hide_viewport] == [other]
     bpy.ops.objectgs.solo_object()
     assert not any(layer.hide_viewport for layer in layers.values())
+
+
+def test_selection_of_many_objects_is_found_without_a_search_for_each(fresh, tmp_path, monkeypatch):
+    root = scene.show_capture(bpy.context.scene, write_folder(tmp_path / "many"))
+    many = {object_id: bpy.data.collections.new(f"{object_id}") for object_id in range(1, 101)}
+    for object_id, collection in many.items():
+        kinds.mark(collection, kinds.OBJECT, object_id)
+        root.children.link(collection)
+        obj = bpy.data.objects.new(f"{object_id}", None)
+        kinds.mark(obj, kinds.OBJECT_PARENT, object_id)
+        obj.parent = kinds.parent_of(root) if object_id % 2 else None
+        collection.objects.link(obj)
+        obj.select_set(True)
+    other = bpy.data.objects.new("other", None)
+    bpy.context.scene.collection.objects.link(other)
+    other.select_set(True)
+    searched, parent_of = [], kinds.parent_of
+    monkeypatch.setattr(kinds, "parent_of", lambda root: searched.append(root) or parent_of(root))
+    assert set(selection.selected_collections(bpy.context, root)) == set(many.values())
+    assert set(selection.selected_ids(bpy.context, root)) == set(many)
+    assert len(searched) <= 4
 
 
 def test_active_row_selects_object(root):
