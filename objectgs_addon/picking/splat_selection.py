@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from ...backend.shared.splats.picking import Cloud, PickObject, View, pick
-from ...backend.shared.splats.regions import in_region, in_sphere, near_selected, to_camera
+from ...backend.shared.splats.regions import away_from_others, in_region, in_sphere, near_selected, to_camera
 from ...backend.shared.splats.visibility import VISIBLE, Occlusion
 from .. import drawing, scene
 from ..drawing.splat_arrays import SplatArrays, arrays_of
@@ -137,7 +137,7 @@ def grow(parts: Sequence[bpy.types.Object], distance: float) -> int:
 
 def shrink(parts: Sequence[bpy.types.Object], distance: float) -> int:
     """Deselect the splats within a distance in world units of others; return the number of selected splats."""
-    return _select_by_points(parts, lambda points, selected: ~near_selected(points, ~selected, distance))
+    return _select_by_points(parts, lambda points, selected: away_from_others(points, selected, distance))
 
 
 def usual_distance(parts: Sequence[bpy.types.Object]) -> float:

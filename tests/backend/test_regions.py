@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+import tracemalloc
 
 import numpy as np
 import pytest
 
 from backend.shared.splats.picking import Cloud, PickObject, View
 from backend.shared.splats.regions import (
+    away_from_others,
     box_region,
     brush_region,
     in_region,
@@ -112,6 +114,25 @@ def test_near_points_are_found_within_the_distance():
     assert near[selected].all() and near[away < 0.2 * (1 - np.sqrt(3) / 2)].all()
     assert not near[away > 0.2 * (1 + np.sqrt(3) / 2)].any()
     assert not near_selected(points, np.zeros(len(points), bool), 0.2).any()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_points_away_from_others_are_those_that_are_not_near_them(share):
+    points = np.random.default_rng(0).uniform(-1, 1, (5000, 3)) + 500.0
+    selected = np.linalg.norm(points - 500.0, axis=1) < share * 2.0
+    assert np.array_equal(away_from_others(points, selected, 0.1), ~near_selected(points, ~selected, 0.1))
+
+
+def test_points_away_from_others_take_no_more_memory_for_a_large_scene():
+    points = np.random.default_rng(0).uniform(-1, 1, (100_000, 3))
+    selected = np.linalg.norm(points, axis=1) < 0.1
+    tracemalloc.start()
+    try:
+        away_from_others(points, selected, 0.04)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 150 * len(points)
 
 
 def layers(opacity=0.9):

@@ -119,10 +119,29 @@ def near_selected(points: NDArray, selected: NDArray[np.bool_], distance: float)
     Returns:
         (N,) bool; true for the selected points, too.
     """
+    return _near(_cell_numbers(points, distance), selected)
+
+
+def away_from_others(points: NDArray, selected: NDArray[np.bool_], distance: float) -> NDArray[np.bool_]:
+    """Find the selected points that are not near others, on the grid of `near_selected`; arguments as there."""
+    numbers = _cell_numbers(points, distance)
+    found = _near(numbers, selected)
+    # In a large scene, most of the others are nowhere near the selected points.
+    found[found] = ~_near(numbers[found], ~selected[found])
+    return found
+
+
+def _cell_numbers(points: NDArray, distance: float) -> NDArray[np.uint64]:
+    """Return the number (N,) of the cell of each point."""
+    if not len(points):
+        return np.zeros(0, np.uint64)
+    return _mixed(np.floor((points - points.min(0)) * (_CELLS / distance)).astype(np.int64))
+
+
+def _near(numbers: NDArray[np.uint64], selected: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which of the numbers of cells (N,) are of cells near those of the selected points."""
     if not selected.any():
         return selected.copy()
-    cells = np.floor((points - points.min(0)) * (_CELLS / distance)).astype(np.int64)
-    numbers = _mixed(cells)
     sides = np.arange(-_CELLS, _CELLS + 1)
     steps = np.stack(np.meshgrid(sides, sides, sides), -1).reshape(-1, 3)
     steps = steps[np.einsum("ij,ij->i", steps, steps) <= _CELLS**2]
