@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Blender cameras that exactly match the pinhole cameras in cameras.json."""
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -31,6 +32,11 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
             there.setdefault(obj["objectgs_image"], obj)
     poses = [_pose(view, cameras.origin) for view in cameras.views]
     display = DISPLAY_SIZE * _spacing(np.array([pose[:3, 3] for pose in poses]))
+    photos = {
+        _file_of(image): image
+        for image in reversed(list(bpy.data.images))
+        if image.library is None and image.source == "FILE"
+    }
     for view, pose in zip(cameras.views, poses):
         obj = there.pop(view.name, None)
         if obj is None or obj.data is None:
@@ -43,7 +49,7 @@ def show_cameras(capture: bpy.types.Collection, parent: bpy.types.Object, camera
             capture.objects.link(obj)
         _place(obj, pose)
         _set_lens(obj.data, view)
-        _set_background(obj.data, view)
+        _set_background(obj.data, view, photos)
         obj["held_out"] = view.held_out
         obj["width"], obj["height"] = view.width, view.height
         obj["pixel_aspect"] = view.aspect
@@ -137,8 +143,11 @@ def _set_lens(camera: bpy.types.Camera, view: CameraView) -> None:
     camera.shift_y = (view.K[1, 2] - view.height / 2.0) / view.aspect / view.width
 
 
-def _set_background(camera: bpy.types.Camera, view: CameraView) -> None:
-    """Set the photo as background image; Blender reads the file when it first draws it."""
+def _set_background(camera: bpy.types.Camera, view: CameraView, photos: dict[Path, bpy.types.Image]) -> None:
+    """Set the photo as background image; Blender reads the file when it first draws it.
+
+    photos: the images of the .blend by their files, to which a new one is added.
+    """
     ours = next(
         (entry for entry in camera.background_images if entry.image is not None and entry.image.get(KIND) == "photo"),
         None,
@@ -152,9 +161,16 @@ def _set_background(camera: bpy.types.Camera, view: CameraView) -> None:
         ours.alpha = 1.0
         ours.frame_method = "FIT"
         camera.show_background_images = True
-    if ours.image is None or Path(bpy.path.abspath(ours.image.filepath)) != view.image:
-        ours.image = bpy.data.images.load(str(view.image), check_existing=True)
+    if ours.image is None or _file_of(ours.image) != view.image:
+        if view.image not in photos:  # With `check_existing`, Blender would search all images for each.
+            photos[view.image] = bpy.data.images.load(str(view.image))
+        ours.image = photos[view.image]
         ours.image[KIND] = "photo"
+
+
+def _file_of(image: bpy.types.Image) -> Path:
+    """Return the file of an image, whose path may be relative to the .blend."""
+    return Path(os.path.normpath(bpy.path.abspath(image.filepath)))
 
 
 def _spacing(centers: np.ndarray) -> float:

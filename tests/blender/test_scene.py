@@ -4,6 +4,7 @@
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -16,6 +17,7 @@ from objectgs.backend.shared.formats.ply import write_vertices
 from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.backend.shared.splats.spherical_harmonics import C0
 from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.scene import cameras as camera_module
 from objectgs.objectgs_addon.scene import carrier, kinds
 from objectgs.objectgs_addon.scene.shading import modifiers, node_groups
 from objectgs.objectgs_addon.scene.shading.materials import COLOR
@@ -105,6 +107,31 @@ def test_camera_has_photo_and_sets_render_size(root, folder):
         assert Path(image.filepath) == folder / "images" / camera.name
         assert image.packed_file is None
         assert 0.05 < camera.data.display_size < 3
+
+
+def test_photos_are_loaded_once_without_a_search_for_each(fresh, folder, monkeypatch):
+    (folder / "below").mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "below" / "own.blend"))
+    own = bpy.data.images.load(str(folder / "images" / "002.png"))
+    own.filepath = "//../images/002.png"
+    asked = []
+
+    class Images:
+        """Blender's images, which note how they are loaded."""
+
+        def __iter__(self):
+            return iter(bpy.data.images)
+
+        def load(self, path, check_existing=False):
+            asked.append(check_existing)
+            return bpy.data.images.load(path, check_existing=check_existing)
+
+    data = SimpleNamespace(images=Images(), objects=bpy.data.objects, cameras=bpy.data.cameras)
+    monkeypatch.setattr(camera_module, "bpy", SimpleNamespace(data=data, path=bpy.path))
+    for _ in range(2):
+        root = blender_scene.show_capture(bpy.context.scene, folder)
+        photos = [camera.data.background_images[0].image for camera in cameras_of(root)]
+        assert photos[2] == own and len(set(photos)) == 8 and asked == [False] * 7
 
 
 def test_user_camera_and_render_size_are_kept(fresh, folder):
