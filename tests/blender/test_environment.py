@@ -571,6 +571,15 @@ def test_pip_failures_are_explained(lines, sentence):
     assert sentence in pip.why_pip_failed(lines)
 
 
+def test_remains_of_a_package_do_not_count_as_one(tmp_path):
+    """pip renames what it could not remove, and warns of it from then on."""
+    for name, text in ("good-1.0", "Name: Good\nVersion: 1.0\n"), ("~orch-2.1.0", None), ("empty-1.0", "Name: empty\n"):
+        (tmp_path / f"{name}.dist-info").mkdir()
+        if text is not None:
+            (tmp_path / f"{name}.dist-info" / "METADATA").write_text(text)
+    assert pip.Pip(Path(sys.executable), tmp_path, tmp_path, None, None).packages == {"good": "1.0"}
+
+
 @pytest.mark.parametrize(
     ("version", "has_truststore", "features"),
     [

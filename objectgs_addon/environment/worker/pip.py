@@ -56,9 +56,11 @@ class Pip:
     @property
     def packages(self) -> dict[str, str]:
         """Names and versions of the installed packages."""
+        # What an interrupted pip has left behind may have no metadata.
         return {
-            found.metadata["Name"].lower(): found.version
+            name.lower(): found.version
             for found in importlib.metadata.distributions(path=[str(self.site)])
+            if (name := found.metadata["Name"]) and found.version
         }
 
     def install(self, arguments: list[str], megabytes: float) -> None:
