@@ -15,6 +15,7 @@ from .. import drawing
 from ..drawing.shaders import SELECTED_COLOR
 from ..drawing.splat_arrays import arrays_of
 from . import tool as pick_tool
+from .hit_test import draws_splats
 
 TOOL = "objectgs.select_splats"
 _SELECT = "objectgs.select_splats"
@@ -86,7 +87,7 @@ def circle(x: float, y: float, radius: float) -> list[tuple[float, float]]:
 def _draw() -> None:
     """Draw the centers of the selected splats, which the preview of splats does not highlight."""
     context = bpy.context
-    if context.scene.objectgs.draw_splats or not context.space_data.overlay.show_overlays:
+    if draws_splats(context) or not context.space_data.overlay.show_overlays:
         return
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     for part in drawing.splat_parts(context.view_layer, context.space_data):

@@ -18,7 +18,7 @@ from objectgs.backend.shared.splats.picking import View
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
 from objectgs.objectgs_addon.blender import messages
-from objectgs.objectgs_addon.drawing import splat_arrays
+from objectgs.objectgs_addon.drawing import splat_arrays, viewport
 from objectgs.objectgs_addon.drawing.gather import gather, placed_parts
 from objectgs.objectgs_addon.environment import locations
 from objectgs.objectgs_addon.panels.objects import MarkingPanel
@@ -476,6 +476,11 @@ def test_panel_says_why_marks_are_not_shown(root, session):
     assert "switch Draw Splats on" in texts_of(MarkingPanel)
     pointing.stop()
     assert "not shown" not in texts_of(MarkingPanel)
+
+
+def test_panel_says_that_marks_are_not_shown_where_drawing_has_failed(root, session, monkeypatch):
+    monkeypatch.setattr(viewport, "_failure", "no memory")
+    assert "The marks are not shown: no memory" in texts_of(MarkingPanel)
 
 
 def test_strokes_are_answered_with_the_model_of_the_preferences(root, monkeypatch, tmp_path):

@@ -5,6 +5,8 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -18,8 +20,9 @@ from objectgs.backend.shared.splats.picking import View
 from objectgs.backend.shared.splats.regions import box_region, brush_region, lasso_region
 from objectgs.objectgs_addon import drawing
 from objectgs.objectgs_addon import scene as blender_scene
+from objectgs.objectgs_addon.drawing import viewport
 from objectgs.objectgs_addon.drawing.splat_arrays import arrays_of
-from objectgs.objectgs_addon.picking import splat_selection
+from objectgs.objectgs_addon.picking import splat_selection, splats_tool
 from objectgs.objectgs_addon.scene import carrier, kinds
 from objectgs.objectgs_addon.scene.edits import single_splats
 from objectgs.objectgs_addon.scene.shading import node_groups
@@ -272,6 +275,24 @@ def test_drawing_gets_the_selection_and_keeps_the_splats(root):
     assert drawing.gather.gather([drawing.gather.placed(part(1))], marks=False)[0].selected is None
     select(1, [])
     assert drawing.gather.gather([drawing.gather.placed(part(1))])[0].selected is None
+
+
+def test_selected_splats_are_marked_where_they_are_not_drawn(root, monkeypatch):
+    """Without Draw Splats, and where drawing has failed, previews are shown, which do not highlight them."""
+    select(1, [0, 1])
+    marked, shown_parts = [], parts()
+    batch = SimpleNamespace(draw=lambda _shader: marked.append(True))
+    monkeypatch.setattr(splats_tool, "gpu", MagicMock())
+    monkeypatch.setattr(splats_tool, "batch_for_shader", lambda *_: batch)
+    space = SimpleNamespace(overlay=SimpleNamespace(show_overlays=True))
+    context = SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer, space_data=space)
+    monkeypatch.setattr(splats_tool, "bpy", SimpleNamespace(context=context))
+    monkeypatch.setattr(splats_tool.drawing, "splat_parts", lambda *_: shown_parts)
+    for failure, draw_splats, count in ((None, True, 0), ("no memory", True, 1), (None, False, 2)):
+        bpy.context.scene.objectgs.draw_splats = draw_splats
+        monkeypatch.setattr(viewport, "_failure", failure)
+        splats_tool._draw()
+        assert len(marked) == count
 
 
 def test_duplicates_share_the_selection(root):

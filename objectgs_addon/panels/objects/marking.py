@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ... import drawing
 from ...picking import marks
 from ...running import background, pointing
 from ...running.job_display import write
@@ -130,6 +131,8 @@ def _why_hidden(context: bpy.types.Context) -> str:
     """Return why a viewport does not show the marks on splats, and what to do; "" if it shows them."""
     if not context.scene.objectgs.draw_splats:
         return "The marks are not shown; switch Draw Splats on in the panel ObjectGS."
+    if reason := drawing.failure():
+        return f"The marks are not shown: {reason}"
     if context.space_data is not None and not context.space_data.overlay.show_overlays:
         return "The marks are not shown; switch the viewport's overlays on."
     return ""
