@@ -644,6 +644,25 @@ def test_download_of_a_local_version_is_found(root):
     assert shown == ["Downloading torch (2000.0 MB)", pytest.approx(0.25 * 2 / 3)]
 
 
+@pytest.mark.parametrize(
+    ("line", "file"),
+    [
+        ("  Downloading https://mirror/get/foo-1.0-py3-none-any.whl?sig=a/b (12.3 kB)", "foo-1.0-py3-none-any.whl"),
+        ("  Using cached foo-1.0-py3-none-any.whl (12.3 MB)", "foo-1.0-py3-none-any.whl"),
+        ("  Downloading https://mirror/get?file=foo-1.0-py3-none-any.whl (12.3 kB)", ""),
+        ("  Downloading foo-1.0-py3-none-any.whl.metadata (12.3 kB)", ""),
+        ("Collecting", ""),
+    ],
+)
+def test_lines_of_pip_tell_which_file_is_downloaded(root, line, file):
+    """A mirror's addresses may have a query, such as a signature."""
+    progress = SimpleNamespace(status=lambda _text: None)
+    installer = pip.Pip(Path(sys.executable), root, root, progress, lambda: False)
+    installer._downloaded, installer._file, installer._file_size, installer._installing = 0.0, "", 0.0, []
+    installer._line(line)
+    assert installer._file == file
+
+
 def test_download_that_vanishes_does_not_end_the_setup(root, monkeypatch):
     """As when pip deletes its temporary folder while it is searched."""
     shown = []

@@ -128,11 +128,11 @@ class Pip:
         self.lines.append(line)
         words = line.split()
         size = re.search(r"\(([\d.]+) ([kMG])B\)$", line)
-        if words[0] == "Collecting":
+        address = next((word.partition("?")[0] for word in words if ".whl" in word), "")
+        if words[0] == "Collecting" and len(words) > 1:
             self.progress.status(f"Resolving {re.split('[^A-Za-z0-9._-]', words[1])[0]}")
-        elif line.lstrip().startswith(("Downloading ", "Using cached ")) and size and ".metadata" not in line:
+        elif words[0] in ("Downloading", "Using") and size and address.endswith(".whl"):
             self._downloaded += self._file_size
-            address = next(word for word in words if word.endswith(".whl"))
             self._file = urllib.parse.unquote(address.rsplit("/", 1)[-1])
             self._file_size = float(size[1]) * {"k": 1e-3, "M": 1, "G": 1e3}[size[2]]
             if words[0] == "Downloading":
