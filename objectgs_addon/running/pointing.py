@@ -148,13 +148,13 @@ class _Session:
         if self._asked_strokes[:known] != self.answered_strokes:
             return None
         drawn = {stroke["object"] for stroke in self._asked_strokes[known:]} - {marks.NOTHING}
-        before = self.objects[self.classes]
-        found = [
-            (taker, loser, float((owners[before == loser] == taker).mean()))
-            for loser in np.unique(before).tolist()
-            for taker in drawn - {loser}
-            if loser != marks.NOTHING
-        ]
+        total = np.bincount(self.classes, minlength=len(self.objects))
+        found = []
+        for taker in drawn:
+            taken = np.bincount(self.classes[owners == taker], minlength=len(self.objects)) / np.maximum(total, 1)
+            taken[(self.objects == taker) | (self.objects == marks.NOTHING)] = 0.0
+            loser = int(taken.argmax())
+            found.append((taker, int(self.objects[loser]), float(taken[loser])))
         most = max(found, key=lambda each: each[2], default=None)
         return most if most is not None and most[2] > _NOTICEABLE else None
 

@@ -700,6 +700,24 @@ def test_a_problem_is_shown_until_the_marks_change(root, session, monkeypatch):
     assert not shown
 
 
+def test_what_a_stroke_took_most_of_is_found_among_many_objects(session):
+    rng = np.random.default_rng(0)
+    session.objects = np.array([7, marks.NOTHING, 30, 2, 9, 4])
+    for takers in ((2,), (9, 30), (marks.NOTHING,)):
+        session.classes = rng.choice(5, len(session.keys))  # The last object has no splats.
+        owners = session.objects[rng.integers(0, 6, len(session.keys))]
+        session._asked_strokes = [{"object": taker} for taker in takers]
+        before = session.objects[session.classes]
+        shares = {
+            (taker, loser): float((owners[before == loser] == taker).mean())
+            for taker in takers
+            for loser in set(before.tolist()) - {taker, marks.NOTHING}
+            if taker != marks.NOTHING
+        }
+        taken = session._most_taken(owners)
+        assert taken is None if not shares else taken[2] == shares[taken[:2]] == max(shares.values())
+
+
 def test_a_stroke_that_takes_a_part_of_another_object_says_so(root, session, monkeypatch):
     shown = {}
     monkeypatch.setattr(messages, "show", lambda text, kind: shown.update({text: kind}))
