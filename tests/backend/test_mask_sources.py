@@ -405,10 +405,26 @@ def test_255_is_white_only_where_all_masks_are_black_and_white(photos, tmp_path)
     for values, expected in (((0, 255), {1}), ((0, 85, 255), {85, 255})):
         given = tmp_path / str(len(values))
         given.mkdir()
-        Image.fromarray(np.resize(np.array(values, np.uint8), SIZE[::-1])).save(given / "photo 0.png")
+        Image.fromarray(np.array(values, np.uint8)[masks_of(0) % len(values)]).save(given / "photo 0.png")
         Image.fromarray(np.resize(np.array([0, 255], np.uint8), SIZE[::-1])).save(given / "photo 1.png")
         source = open_source(given, photos, [photo(0), photo(1)])
         assert {key for n in (0, 1) for key in source.read(photo(n)).objects} == expected
+
+
+@pytest.mark.parametrize("white", [255, 65535])
+def test_soft_edges_of_black_and_white_masks_are_no_ids(white, photos, tmp_path):
+    distance = np.hypot(*np.mgrid[-15:15, -20:20])
+    for n, radius in enumerate((12, 8.6)):
+        soft = np.clip(radius - distance + 0.5, 0, 1) * white
+        Image.fromarray(soft.astype(np.min_scalar_type(white))).save(tmp_path / f"photo {n}.png")
+    source = open_source(tmp_path, photos, [photo(0), photo(1)])
+    for n, radius in enumerate((12, 8.6)):
+        found = source.read(photo(n))
+        assert found.objects == [1] and ((found.numbers == 1) == (distance < radius)).mean() > 0.98
+    shades = np.linspace(0, white, SIZE[0] * SIZE[1]).astype(np.min_scalar_type(white))
+    Image.fromarray(shades.reshape(SIZE[::-1])).save(tmp_path / "photo 0.png")
+    with pytest.raises(InputError, match="not black and white"):
+        open_source(tmp_path, photos, [photo(0), photo(1)]).read(photo(0))
 
 
 def test_masks_of_a_missing_photo_are_left_out(write_capture, tmp_path, run_command):

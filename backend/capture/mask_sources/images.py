@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -22,8 +23,11 @@ from ..models.photos import Photos
 from ..names import read_names
 from .segments import Segments, Shape, draw_shapes
 
-_GRAY = 0.02
-"""Largest fraction of pixels that are neither black nor white in a JPEG that is black and white."""
+_GRAY, _SOFT = 0.02, 0.1
+"""Largest fraction of pixels that are neither black nor white in a JPEG that is black and white, and at soft edges."""
+
+_WHITE = (255, 65535)
+"""White in 8 and 16 bits."""
 
 _MOST_COLORS = 256
 """Largest number of colors of a file that is taken for a mask rather than for a picture, where both are there."""
@@ -68,8 +72,8 @@ class MaskFiles:
             ids = read_black_and_white(path).astype(np.int64)
         else:
             ids = read_mask(path, self._is_color).astype(np.int64)
-            if _is_white(ids) and self._all_are_white():
-                ids = np.minimum(ids, 1)
+            if self._all_are_white():
+                ids = _is_white(ids if ids.max() <= 255 else ids * 255 // 65535, path, _SOFT).astype(np.int64)
         found, numbers = np.unique(ids, return_inverse=True)
         offset = 0 if len(found) and found[0] == 0 else 1
         values = found[1 - offset :].tolist()
@@ -80,7 +84,9 @@ class MaskFiles:
         """Return whether all files are in black and white; otherwise, 255 is the ID of an object as any other."""
         if self._is_black_and_white is None:
             paths = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
-            self._is_black_and_white = all(_is_white(read_mask(path, self._is_color)) for path in paths)
+            masks = (read_mask(path, self._is_color) for path in paths)
+            has_white = [bool(np.isin(ids, _WHITE).any()) for ids in takewhile(_has_no_area_of_gray, masks)]
+            self._is_black_and_white = len(has_white) == len(paths) and any(has_white)
         return self._is_black_and_white
 
 
@@ -103,9 +109,11 @@ def _is_picture(path: Path) -> bool:
     return is_three_channel(path) and read_image(path).getcolors(_MOST_COLORS) is None
 
 
-def _is_white(ids: np.ndarray) -> bool:
-    """Return whether a mask has no other values than 0 and 255."""
-    return bool(((ids == 0) | (ids == 255)).all())
+def _has_no_area_of_gray(ids: np.ndarray) -> bool:
+    """Return whether a mask has no areas of other values than black and white, such as IDs, but at most soft edges."""
+    gray = ~np.isin(ids, (0, *_WHITE))
+    is_flat = (ids[1:] == ids[:-1])[:, 1:] & (ids[:, 1:] == ids[:, :-1])[1:]
+    return bool(2 * (gray[1:, 1:] & is_flat).sum() <= gray.sum())
 
 
 class MaskFolders:
@@ -161,11 +169,16 @@ def read_black_and_white(path: Path) -> np.ndarray:
     gray = np.asarray(read_image(path).convert("L"))
     if gray.max(initial=0) <= 1:
         return gray > 0
+    return _is_white(gray, path)
+
+
+def _is_white(gray: np.ndarray, path: Path, most: float = _GRAY) -> np.ndarray:
+    """Return where gray values from 0 to 255 (h, w) are white; raises InputError if more than `most` are neither."""
     between = float(((gray > 64) & (gray < 192)).mean())
-    if between > _GRAY:
+    if between > most:
         raise InputError(
             f"{path} is not black and white, since {between:.0%} of its pixels are gray; save masks with several "
-            "objects as PNG with IDs."
+            "objects as PNG with IDs, and a mask of one object with sharp edges."
         )
     return gray > 127
 
