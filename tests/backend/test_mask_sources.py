@@ -608,6 +608,23 @@ def test_names_beside_given_masks_are_those_of_their_ids(objects, write_capture,
     assert listed(folder)[1] == ("mug" if objects == "given" else "spoon")
 
 
+@pytest.mark.parametrize("labels", [None, "1 mug\n2 box\n5 can\n"])
+def test_objects_that_are_found_again_in_kept_masks_keep_their_names(labels, write_capture, run_command):
+    """The names in labels.json are those of IDs that these masks do not have."""
+    folder = write_capture(views=6, points=200).folder
+    (folder / "labels.json").unlink()
+    if labels is not None:
+        (folder / "labels.txt").write_text(labels)
+    for number, path in enumerate(sorted((folder / "masks").iterdir())):
+        order = [5, 1, 2] if number else [2, 5, 1]
+        Image.fromarray(np.array([0, *order[:2], 0, 0, order[2]], np.uint8)[read_mask(path)]).save(path)
+    assert run_command("masks", folder, folder / "masks", "--objects", "find").code == EXIT_DONE
+    before = listed(folder)
+    assert len(set(before.values())) == 3
+    assert run_command("masks", folder, folder / "masks-given", "--objects", "find").code == EXIT_DONE
+    assert listed(folder) == before
+
+
 def test_names_of_other_ids_are_not_taken(photos, tmp_path, run_command):
     (photos / "labels.json").write_text('{"1": "spoon", "2": "fork"}')
     path = write_cvat_video(tmp_path)

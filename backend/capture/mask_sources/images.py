@@ -19,6 +19,7 @@ from ..files import (
     read_image,
     read_mask,
 )
+from ..made_masks import is_made
 from ..models.photos import Photos
 from ..names import read_names
 from .segments import Segments, Shape, draw_shapes
@@ -60,7 +61,9 @@ class MaskFiles:
         self.photos: Sequence[str] = sorted(self.files)
         self.lossy = [name for name in self.photos if self.files[name].suffix.lower() in LOSSY_SUFFIXES]
         self.what = "ID masks"
-        self._labels = {**read_names(folder.parent), **read_names(folder)} if self.files else {}
+        # Beside masks that were made of these, the names are those of the objects there.
+        has_own = folder.name != "masks" and is_made(folder.parent / "masks")
+        self._labels = {**({} if has_own else read_names(folder.parent)), **read_names(folder)} if self.files else {}
         color = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
         self._is_color = bool(color) and all(map(is_three_channel, color)) and any(map(is_color_mask, color))
         self._is_black_and_white: bool | None = None
