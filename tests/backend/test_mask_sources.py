@@ -284,6 +284,21 @@ def test_objects_of_every_format_are_those_that_were_written(write, photos, tmp_
     )
 
 
+@pytest.mark.parametrize(("left", "top", "right", "bottom"), [(-4, -3, 43, 32), (3, 2, 36, 28)])
+def test_photo_is_the_display_window_of_exr_files(left, top, right, bottom, photos, tmp_path):
+    """Also of those with overscan, or cropped to what they show."""
+    given = tmp_path / "given"
+    given.mkdir()
+    around = np.pad(masks_of(0), 10)[top + 10 : bottom + 11, left + 10 : right + 11].astype(np.float32)
+    windows = {
+        "dataWindow": (np.array([left, top], np.int32), np.array([right, bottom], np.int32)),
+        "displayWindow": (np.zeros(2, np.int32), np.array(SIZE, np.int32) - 1),
+    }
+    with OpenEXR.File({"type": OpenEXR.scanlineimage, **windows}, {"IndexOB.X": around}) as file:
+        file.write(str(given / "photo 0.exr"))
+    assert np.array_equal(open_source(given, photos, [photo(0)]).read(photo(0)).numbers, masks_of(0))
+
+
 @pytest.mark.parametrize("write", [write_coco_polygons, write_cvat_images, write_label_studio])
 def test_photos_that_nobody_has_annotated_get_no_mask(write, photos, tmp_path, run_command):
     """Their objects would be lost otherwise."""

@@ -12,7 +12,7 @@ import numpy as np
 import OpenEXR
 
 from ...shared.errors import InputError
-from .segments import Segments
+from .segments import Segments, checked_size
 
 _OBJECT_INDEX = re.compile(r"(.*\.)?(IndexOB|object[ _]?(index|id)|id)(\.[XYRV])?", re.IGNORECASE)
 _MATERIAL_INDEX = re.compile(r"(.*\.)?(IndexMA|material[ _]?index)(\.[XYRV])?", re.IGNORECASE)
@@ -40,7 +40,11 @@ class ExrMasks:
             with OpenEXR.File(str(path), separate_channels=True) as file:
                 # Blender writes a part for each pass, and describes Cryptomatte in the first one only.
                 header = {key: value for part in file.parts for key, value in part.header.items()}
-                channels = {name: np.array(each.pixels) for part in file.parts for name, each in part.channels.items()}
+                channels = {
+                    name: _in_display(np.array(each.pixels), part.header, path)
+                    for part in file.parts
+                    for name, each in part.channels.items()
+                }
         except (OSError, RuntimeError, ValueError, TypeError) as error:
             raise InputError(f"{path} cannot be read as OpenEXR ({error}); render it again.") from error
         found = _cryptomatte(header, channels) or _indices(channels)
@@ -50,6 +54,18 @@ class ExrMasks:
                 f"{', '.join(sorted(channels)[:10])}."
             )
         return found
+
+
+def _in_display(pixels: np.ndarray, header: dict[str, Any], path: Path) -> np.ndarray:
+    """Return pixels (h, w) of the data window in the display window, which is the photo; 0 where there are none."""
+    (left, top), _ = header["dataWindow"]
+    (first_x, first_y), (last_x, last_y) = header["displayWindow"]
+    width, height = checked_size(int(last_x) - int(first_x) + 1, int(last_y) - int(first_y) + 1, str(path))
+    x, y = int(left) - int(first_x), int(top) - int(first_y)
+    shown = np.zeros((height, width), pixels.dtype)
+    inside = pixels[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
+    shown[max(y, 0) :, max(x, 0) :][: inside.shape[0], : inside.shape[1]] = inside
+    return shown
 
 
 def _cryptomatte(header: dict[str, Any], channels: dict[str, np.ndarray]) -> Segments | None:
