@@ -186,6 +186,22 @@ def write_label_studio(folder):
     return path
 
 
+def write_label_studio_of_separate_labels(folder):
+    """As with the tags Rectangle, Labels and TextArea in place of RectangleLabels."""
+    path = write_label_studio(folder)
+    tasks = json.loads(path.read_text())
+    for task in tasks:
+        separate = []
+        for number, result in enumerate(task["annotations"][0]["result"]):
+            shape = {key: value for key, value in result["value"].items() if not key.endswith("labels")}
+            (label,) = (value for key, value in result["value"].items() if key.endswith("labels"))
+            values = [shape, {**shape, "labels": label}, {**shape, "text": ["as a note"]}]
+            separate += [{**result, "id": f"region {number}", "value": value} for value in values]
+        task["annotations"][0]["result"] = separate
+    path.write_text(json.dumps(tasks))
+    return path
+
+
 def write_cryptomatte(folder):
     for n in (0, 1):
         ids = np.choose(masks_of(n), (0, *(name_bits(name) for name in NAMES.values()))).astype(np.uint32)
@@ -258,8 +274,8 @@ def write_object_folders(folder):
 
 GIVEN = [
     write_coco_polygons, write_coco_runs, write_coco_compressed, write_panoptic, write_cvat_images, write_cvat_video,
-    write_label_studio, write_cryptomatte, write_cryptomatte_of_cycles, write_index_pass, write_index_pass_of_blender,
-    write_ids, write_object_folders,
+    write_label_studio, write_label_studio_of_separate_labels, write_cryptomatte, write_cryptomatte_of_cycles,
+    write_index_pass, write_index_pass_of_blender, write_ids, write_object_folders,
 ]  # fmt: skip
 
 

@@ -51,9 +51,10 @@ class LabelStudioMasks:
         try:
             for task in content:
                 name = _photo_of(task, photos, uploaded)
-                results = [each for annotation in task["annotations"] for each in annotation["result"]]
                 if name is not None:
-                    self._results[name] = [each for each in results if "original_width" in each]
+                    self._results[name] = [
+                        each for annotation in task["annotations"] for each in _regions(annotation["result"])
+                    ]
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error
         # Photos that nobody has annotated yet are listed, too.
@@ -98,6 +99,16 @@ def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Se
         if found is not None:
             return found
     return None
+
+
+def _regions(results: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """Return one result for each region, whose label, text and others are results, too, with the same shape and id."""
+    regions: dict[Any, dict[str, Any]] = {}
+    for number, each in enumerate(results):
+        if "original_width" in each:
+            region = regions.setdefault(each.get("id") or (number,), {**each, "value": {}})
+            region["value"] = {**each["value"], **region["value"]}
+    return list(regions.values())
 
 
 def _as_uploaded(name: str) -> str:
