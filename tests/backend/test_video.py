@@ -12,6 +12,7 @@ import pytest
 from PIL import Image, ImageCms, ImageFilter
 
 from backend.capture.files import read_mask
+from backend.capture.made_masks import kept_masks, new_masks, write_mask
 from backend.sfm.sources import masks, motion, photo_files, photos, video
 from backend.shared.color import hdr
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, Cancelled, InputError
@@ -463,6 +464,34 @@ def test_masks_that_changed_are_copied_again_unless_others_were_made_of_them(tmp
     assert copied(3, '{"3": "cup"}') == (3, 1, '{"3": "cup"}')
     (capture / "masks" / "masks.json").write_text("{}")
     assert copied(1, '{"1": "mug"}') == (3, 1, '{"3": "cup"}')
+
+
+def test_given_masks_do_not_come_beside_those_that_were_made_of_them(tmp_path):
+    """They are kept for a photo that had no pose, so that its features are those on objects, too."""
+    folder, capture = tmp_path / "trip", tmp_path / "capture"
+    for part in ("images", "masks"):
+        (folder / part).mkdir(parents=True)
+
+    def add(*names):
+        for name in names:
+            heic(folder / "images" / f"{name}.jpg")
+            Image.fromarray(np.arange(160, dtype=np.uint8)[None].repeat(120, 0) // 80).save(
+                folder / "masks" / f"{name}.png"
+            )
+        photos.take_photos([folder], capture, None, reporter())
+
+    def listed(part):
+        return sorted(path.name for path in (capture / part).iterdir())
+
+    add("a", "b")
+    with new_masks(capture, kept_masks(capture)) as made:
+        write_mask(made, "a.jpg", np.full((120, 160), 7))
+        (made / "masks.json").write_text("{}")
+    add("c")
+    assert listed("masks") == ["a.jpg.png", "masks.json"] and listed("masks-given") == ["a.png", "b.png", "c.png"]
+    masks.write_object_masks(capture, ["a.jpg", "b.jpg", "c.jpg"], tmp_path / "shown", reporter())
+    shown = [np.asarray(Image.open(tmp_path / "shown" / f"{name}.jpg.png")).mean() for name in "abc"]
+    assert shown == [255, 127.5, 127.5]
 
 
 def test_features_on_objects_are_those_of_the_present_masks(tmp_path):

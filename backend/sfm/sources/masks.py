@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, same_shape
-from ...capture.made_masks import is_made
+from ...capture.made_masks import is_made, kept_masks
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...capture.names import HELD_OUT, read_held_out, read_names
 from ...shared.errors import InputError
@@ -26,11 +26,12 @@ from .stamps import IMAGES, MASKS, Stamps
 def write_masks(
     masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: Stamps
 ) -> None:
-    """Write the masks of photos to the masks/ of a capture; names: of the photos there."""
-    stamps.expect(capture / MASKS / (names[photo] + suffix) for photo in photos for suffix in (".png", ".npz"))
+    """Write the given masks of photos to a capture; names: of the photos there."""
+    place = _place_of_given(capture)
+    stamps.expect(place / (names[photo] + suffix) for photo in photos for suffix in (".png", ".npz"))
     for photo in photos:
         suffix, data = encode_mask(ids_of(masks.read(photo)))
-        target = capture / MASKS / (names[photo] + suffix)
+        target = place / (names[photo] + suffix)
         if _is_missing(target, masks.files[photo], capture, stamps):
             make_folder(target.parent)
             write_atomic(target, data)
@@ -48,17 +49,20 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
     """
     folder = source / MASKS
     renamed = {
-        masks.files[photo]: Path(MASKS) / (names[photo] + masks.files[photo].suffix)
+        masks.files[photo]: names[photo] + masks.files[photo].suffix
         for photo in masks.photos
         if masks.files[photo].relative_to(folder).as_posix() not in mask_names(names[photo])[0]
         and names[photo] != photo
     }
-    others = [path for path in source.iterdir() if path.is_file() and LISTS.fullmatch(path.name)]
-    paths = [*others, *(path for path in (folder.rglob("*") if folder.is_dir() else ()) if path.is_file())]
+    place, found = _place_of_given(capture), folder.rglob("*") if folder.is_dir() else ()
     targets = {
-        path: capture / renamed.get(path, path.relative_to(source))
-        for path in paths
-        if path.suffix.lower() not in LOSSY_SUFFIXES and legible(str(path)) == str(path)
+        **{path: capture / path.name for path in source.iterdir() if LISTS.fullmatch(path.name)},
+        **{path: place / renamed.get(path, path.relative_to(folder)) for path in found},
+    }
+    targets = {
+        path: target
+        for path, target in targets.items()
+        if path.is_file() and path.suffix.lower() not in LOSSY_SUFFIXES and legible(str(path)) == str(path)
     }
     stamps.expect(targets.values())
     for path, target in targets.items():
@@ -99,6 +103,11 @@ def warn_of_gone(photos: Iterable[str], capture: Path, stamps: Stamps, reporter:
         )
 
 
+def _place_of_given(capture: Path) -> Path:
+    """Return the folder of the masks that are given: masks/, unless others were made of them, whose IDs differ."""
+    return kept_masks(capture) if is_made(capture / MASKS) else capture / MASKS
+
+
 def _is_missing(target: Path, path: Path, capture: Path, stamps: Stamps) -> bool:
     """Return whether a mask or list of names is not in the capture, or is one of an earlier state of the given file.
 
@@ -122,8 +131,9 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path, report
     Raises:
         InputError: No photo has a mask, one cannot be read, or the finished capture could not be.
     """
-    masks = Files(capture / MASKS)
-    found = {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
+    found: dict[str, Path] = {}
+    for masks in (Files(kept_masks(capture)), Files(capture / MASKS)):
+        found |= {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
     if not found:
         raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
     _require_readable(capture, names)
