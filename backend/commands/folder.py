@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -114,13 +114,19 @@ def open_reconstruction(options: argparse.Namespace, reporter: Reporter) -> Iter
         yield output, capture
 
 
-def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: Reporter) -> Capture:
+def read_capture(
+    folder: Reconstruction,
+    options: argparse.Namespace,
+    reporter: Reporter,
+    check: Callable[[Capture], None] | None = None,
+) -> Capture:
     """Read a capture, prepare its images in the cache of the reconstruction, and write cameras.json.
 
     Args:
         folder: The reconstruction, locked by this process.
         options: capture (its folder), max_size (longest side in pixels) and the limits of memory.
         reporter: Receives progress and warnings.
+        check: Raises InputError for a capture that is not wanted, before cameras.json is written.
 
     Returns:
         The prepared capture.
@@ -131,6 +137,8 @@ def read_capture(folder: Reconstruction, options: argparse.Namespace, reporter: 
     reporter.begin(READ, "Reading the capture")
     with stage(folder, "read"):
         capture = load_capture(options.capture, folder.cache, memory_for_files(options), options.max_size, reporter)
+        if check is not None:
+            check(capture)
         write_capture_cameras(folder, capture)
     return capture
 

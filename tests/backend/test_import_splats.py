@@ -144,6 +144,19 @@ def test_import_of_spz_assigns_ids_from_masks(run_command, write_capture, tmp_pa
     assert [entry.name for entry in read_objects(out / "objects.json")] == ["sphere 1", "sphere 2", "sphere 5"]
 
 
+def test_refused_import_leaves_the_cameras_of_another_one(run_command, write_capture, tmp_path):
+    scene, other = write_capture(views=6, points=60), write_capture("other", views=4, points=60)
+    splats, out = some_splats(n=len(scene.xyz), degree=0), tmp_path / "imported"
+    for name, place in (("a.ply", 0), ("b.ply", 1000)):
+        splats.means = (scene.xyz + place).astype(np.float32)
+        write_splats(tmp_path / name, splats)
+    assert run_command("import-splats", tmp_path / "a.ply", "--out", out, "--capture", scene.folder).code == EXIT_DONE
+    before = (out / "cameras.json").read_bytes()
+    result = run_command("import-splats", tmp_path / "b.ply", "--out", out, "--capture", other.folder)
+    assert_rejected(result, "Only 0% of the splats lie in the views of")
+    assert (out / "cameras.json").read_bytes() == before
+
+
 BOMB = struct.pack("<IIIBBBB", 0x5053474E, 3, 2**32 - 1, 3, 8, 0, 0) + bytes(1 << 20)
 BAD = {
     "a.spz: empty": (b"", ("not an SPZ",)),

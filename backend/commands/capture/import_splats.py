@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
@@ -56,8 +57,7 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
             write_points(folder.points, _no_points(), _no_votes(0))
             _forget_capture(folder, reporter)
         else:
-            capture = read_capture(folder, options, reporter)
-            _require_visible(capture, splats.means)
+            capture = read_capture(folder, options, reporter, partial(_require_visible, centers=splats.means))
             votes = _no_votes(len(capture.points.xyz))
             if capture.has_masks:
                 names = capture.names
