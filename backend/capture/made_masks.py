@@ -11,6 +11,7 @@ import numpy as np
 
 from ..shared.errors import InputError
 from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file
+from ..shared.formats.json_file import read_json
 from ..shared.reconstruction.folder import STROKES
 from .files import encode_mask
 
@@ -20,7 +21,26 @@ RECORD, REPAIRED = "masks.json", "repair.json"
 
 def is_made(folder: Path) -> bool:
     """Return whether masks/ was made here, of other masks or of strokes, so that it can be replaced."""
-    return any((folder / name).is_file() for name in (RECORD, REPAIRED, STROKES))
+    return is_made_of_others(folder) or is_repaired(folder) or (folder / STROKES).is_file()
+
+
+def is_made_of_others(folder: Path) -> bool:
+    """Return whether masks/ was made of other masks; a masks.json may also be of the program that made them."""
+    return _has(folder / RECORD, "source", "objects")
+
+
+def is_repaired(folder: Path) -> bool:
+    """Return whether masks in masks/ were corrected."""
+    return _has(folder / REPAIRED, "changed")
+
+
+def _has(path: Path, *keys: str) -> bool:
+    """Return whether a JSON file has these keys."""
+    try:
+        content = read_json(path)
+    except InputError:
+        return False
+    return isinstance(content, dict) and content.keys() >= set(keys)
 
 
 def kept_masks(capture: Path) -> Path:

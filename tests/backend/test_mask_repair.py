@@ -117,7 +117,7 @@ def test_masks_made_after_the_training_give_splats_their_objects(write_capture, 
     assert_rejected(run_command("clean-labels", out), "has no masks")
     masks = later.rename(scene.folder / "masks")
     # As the command that made them of others has written it.
-    (masks / "masks.json").write_text('{"objects": [{"id": 1, "name": "ball"}], "largest_id": 9}')
+    (masks / "masks.json").write_text('{"source": "other", "objects": [{"id": 1, "name": "ball"}], "largest_id": 9}')
     given = {path.name: path.read_bytes() for path in masks.iterdir()}
     assert run_command("clean-labels", out).code == EXIT_DONE
     assert rendered(scene, out) > 0.95

@@ -569,8 +569,15 @@ def test_masks_of_somebody_else_are_not_replaced(photos, tmp_path, run_command):
     given.mkdir()
     write_ids(given)
     assert run_command("masks", photos, given).code == run_command("masks", photos, given).code == EXIT_DONE
-    (photos / "masks" / "masks.json").unlink()
-    assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
+    for name, content in (("masks.json", '{"tool": "another", "objects": []}'), ("repair.json", "[]")):
+        (photos / "masks" / "masks.json").unlink()
+        (photos / "masks" / name).write_text(content)
+        before = sorted((photos / "masks").iterdir())
+        assert_rejected(run_command("masks", photos, given), "exists; move it elsewhere")
+        assert sorted((photos / "masks").iterdir()) == before
+    (photos / "masks" / "masks.json").write_text("{}")
+    assert run_command("masks", photos, photos / "masks").code == EXIT_DONE
+    assert {"masks.json", "repair.json"} < {path.name for path in (photos / "masks-given").iterdir()}
 
 
 def listed(capture):

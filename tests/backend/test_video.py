@@ -462,7 +462,7 @@ def test_masks_that_changed_are_copied_again_unless_others_were_made_of_them(tmp
 
     assert copied(1, "{}") == (1, 0, "{}")
     assert copied(3, '{"3": "cup"}') == (3, 1, '{"3": "cup"}')
-    (capture / "masks" / "masks.json").write_text("{}")
+    (capture / "masks" / "masks.json").write_text('{"source": "", "objects": []}')
     assert copied(1, '{"1": "mug"}') == (3, 1, '{"3": "cup"}')
 
 
@@ -486,7 +486,7 @@ def test_given_masks_do_not_come_beside_those_that_were_made_of_them(tmp_path):
     add("a", "b")
     with new_masks(capture, kept_masks(capture)) as made:
         write_mask(made, "a.jpg", np.full((120, 160), 7))
-        (made / "masks.json").write_text("{}")
+        (made / "masks.json").write_text('{"source": "", "objects": []}')
     add("c")
     assert listed("masks") == ["a.jpg.png", "masks.json"] and listed("masks-given") == ["a.png", "b.png", "c.png"]
     masks.write_object_masks(capture, ["a.jpg", "b.jpg", "c.jpg"], tmp_path / "shown", reporter())
@@ -532,7 +532,7 @@ def test_masks_in_a_folder_beside_photos_are_no_photos(tmp_path):
     for number, made in ((2, False), (3, True)):
         (folder / "masks" / f"{number}.jpg.png").unlink()
         if made:
-            (capture / "masks" / "masks.json").write_text("{}")
+            (capture / "masks" / "masks.json").write_text('{"source": "", "objects": []}')
         photos.take_photos([capture], capture, None, reporter())
         told = Told()
         photos.take_photos([folder], capture, None, StoppingReporter(told, StopRequest()))

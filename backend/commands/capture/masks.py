@@ -19,7 +19,15 @@ import numpy as np
 
 from ...capture.colmap import Model
 from ...capture.files import Files, image_size, read_image, same_shape
-from ...capture.made_masks import RECORD, is_made, kept_masks, new_masks, require_place_for_given, write_mask
+from ...capture.made_masks import (
+    RECORD,
+    is_made,
+    is_made_of_others,
+    kept_masks,
+    new_masks,
+    require_place_for_given,
+    write_mask,
+)
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...capture.names import read_names
@@ -155,7 +163,7 @@ def _require_replaceable(capture: Path, given: Path) -> None:
     """Raise InputError if the capture has masks that are neither the given ones nor made here."""
     folder = capture / "masks"
     if given.resolve() == folder.resolve():
-        if (folder / RECORD).is_file():
+        if is_made_of_others(folder):
             raise InputError(f"{folder} was made of other masks, which {folder / RECORD} names; give those.")
         require_place_for_given(capture)
     elif folder.exists() and not is_made(folder):

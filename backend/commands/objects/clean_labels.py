@@ -15,6 +15,7 @@ from ...capture.made_masks import (
     RECORD,
     REPAIRED,
     is_made,
+    is_repaired,
     kept_masks,
     new_masks,
     require_place_for_given,
@@ -166,7 +167,7 @@ def _write(
     """
     before, kept = capture.folder / "masks", kept_masks(capture.folder)
     # Masks that were repaired already are not given ones.
-    is_given = before.is_dir() and not (before / REPAIRED).is_file() and not kept.exists()
+    is_given = before.is_dir() and not is_repaired(before) and not kept.exists()
     with new_masks(capture.folder, kept if is_given else None) as folder:
         whole, files = capture.edited({}, ()), Files(before)
         for index, view in enumerate(capture.views):
