@@ -432,6 +432,28 @@ def test_folders_of_objects_have_those_of_the_photos(photos, tmp_path):
     assert open_source(given, photos, ["left/0001.jpg"]).photos == ["left/0001.jpg", "right/0001.jpg"]
 
 
+@pytest.mark.parametrize(
+    ("folders", "files", "are_objects"),
+    [(range(1, 4), range(1, 6), True), (range(1, 6), range(4), False), (range(1, 6), range(8), False),
+     (range(1, 8), range(1, 6), True), (range(1, 6), range(1, 6), None)],
+)  # fmt: skip
+def test_folders_of_objects_may_be_numbered_as_photos(folders, files, are_objects, tmp_path):
+    (tmp_path / "images").mkdir()
+    for n in range(1, 6):
+        Image.new("RGB", SIZE).save(tmp_path / "images" / f"{n}.jpg")
+    for folder in folders:
+        (tmp_path / "given" / str(folder)).mkdir(parents=True)
+        for file in files:
+            Image.fromarray(masks_of(0) == 1).save(tmp_path / "given" / str(folder) / f"{file}.png")
+    source = open_source(tmp_path / "given", tmp_path, [f"{n}.jpg" for n in range(1, 6)])
+    if are_objects is None:
+        with pytest.raises(InputError, match="may be those of photos or of objects"):
+            source.read("1.jpg")
+    else:
+        assert len(source.photos) == 5 and source.what.endswith("object" if are_objects else "photo")
+        assert len(source.read("1.jpg").names) == len(folders if are_objects else files)
+
+
 def test_255_is_white_only_where_all_masks_are_black_and_white(photos, tmp_path):
     for values, expected in (((0, 255), {1}), ((0, 85, 255), {85, 255})):
         given = tmp_path / str(len(values))

@@ -129,7 +129,6 @@ class MaskFolders:
     """
 
     def __init__(self, folder: Path, photos: Photos) -> None:
-        self._shapes: dict[str, list[tuple[Path, str]]] = {}
         by_photo: dict[str, list[tuple[Path, str]]] = {}
         by_object: dict[str, list[tuple[Path, str]]] = {}
         for path in sorted(folder.rglob("*")):
@@ -140,15 +139,22 @@ class MaskFolders:
             own = PurePosixPath(*within.parts[1:])
             if (name := photos.find(within.parent.as_posix())) is not None:
                 by_photo.setdefault(name, []).append((path, ""))
-            elif (name := photos.find(own.as_posix()) or photos.find(own.with_suffix("").as_posix())) is not None:
+            if (name := photos.find(own.as_posix()) or photos.find(own.with_suffix("").as_posix())) is not None:
                 by_object.setdefault(name, []).append((path, within.parts[0]))
-        self._has_objects = len(by_object) >= len(by_photo)
-        self._shapes = by_object if self._has_objects else by_photo
+        # Objects may be numbered as photos are.
+        of_objects, of_photos = ((len(found), sum(map(len, found.values()))) for found in (by_object, by_photo))
+        self._unclear = folder if of_objects == of_photos else None
+        self._shapes = by_object if of_objects > of_photos else by_photo
         self.photos: Sequence[str] = sorted(self._shapes)
-        self.what = "a folder of masks for each object" if self._has_objects else "a folder of masks for each photo"
+        self.what = f"a folder of masks for each {'object' if of_objects > of_photos else 'photo'}"
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
+        if self._unclear is not None:
+            raise InputError(
+                f"The folders in {self._unclear} may be those of photos or of objects, since the files in them "
+                "are named like photos, too; give the folders names of objects, or rename the files."
+            )
         shapes, size = [], None
         for path, name in self._shapes[photo]:
             inside = read_black_and_white(path)
