@@ -20,6 +20,7 @@ from PIL import Image as PilImage
 from ..shared.class_table import LARGEST_ID
 from ..shared.errors import InputError
 from ..shared.formats.atomic import write_atomic
+from ..shared.formats.photos_source import NOT_OF_USERS
 from ..shared.formats.regular_file import open_regular, require_regular
 
 MASK_SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".bmp")
@@ -45,12 +46,13 @@ class Files:
     """
 
     def __init__(self, folder: Path, without: Collection[str] = ()) -> None:
-        """List the files of `folder`, without those in its subfolders `without`."""
+        """List the files of `folder`, without those in its subfolders `without`, and in those of no user."""
         self.folder = folder
         self.paths: list[str] = []
         for parent, folders, names in os.walk(folder, followlinks=True):
             within = Path(parent).relative_to(folder)
             inside = sorted(name for name in folders if name not in without or parent != str(folder))
+            inside = [name for name in inside if not name.startswith(NOT_OF_USERS)]
             folders[:] = [name for name in inside if not _leads_back(folder, within / name)]
             self.paths += [(within / name).as_posix() for name in sorted(names) if not name.startswith(".")]
         self._levels: list[dict[str, list[str]]] = []

@@ -18,6 +18,9 @@ from .files import encode_mask
 RECORD, REPAIRED = "masks.json", "repair.json"
 """Files in masks/ with how they were made of other masks, and with what was changed in them."""
 
+SEGMENTS = "masks-segments"
+"""Folder of a capture with the segments that models have found, so that a stopped command goes on."""
+
 
 def is_made(folder: Path) -> bool:
     """Return whether masks/ was made here, of other masks or of strokes, so that it can be replaced."""

@@ -36,7 +36,7 @@ from .files import (
     same_shape,
 )
 from .made_masks import is_made
-from .models import none_found, photos_folder, read_capture_model
+from .models import none_found, photo_files, photos_folder, read_capture_model
 from .names import HELD_OUT, read_held_out, read_names
 from .undistort import Pinhole, is_pinhole, pinhole_for, scaled
 
@@ -138,7 +138,7 @@ def survey_capture(
         images_folder = photos_folder(folder)
     elif not images_folder.is_dir():
         raise InputError(f"{images_folder} does not exist; put the images that the COLMAP model names there.")
-    files = Files(images_folder, without=(masks_folder.name,) if images_folder == folder else ())
+    files = photo_files(folder, images_folder)
     masks = Files(masks_folder) if masks_folder.is_dir() and not photos_only else None
     total, absent = len(model.images) + len(model.absent), list(model.absent)
     sources, unmasked, resized = [], [], []

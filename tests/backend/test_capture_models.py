@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from backend.capture import check_capture, load_capture
-from backend.capture.models import read_capture_model
+from backend.capture.models import Photos, read_capture_model
 from backend.capture.models.lens import brown
 from backend.capture.models.point_cloud import read_point_cloud
 from backend.shared.errors import EXIT_BAD_INPUT, EXIT_DONE, InputError
@@ -417,6 +417,29 @@ def test_names_that_fit_several_photos_are_reported(write_capture, tmp_path):
         (images / name).unlink()
     with pytest.raises(InputError, match=f"4 images .*{several}"):
         loaded(scene, tmp_path, "none")
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_images_that_are_no_photos_do_not_count(beside, write_capture):
+    """Thumbnails of a NAS and, where photos are beside the cameras, kept masks and renders of a reconstruction."""
+    scene = write_capture(views=4)
+    folders = [".thumbs", "@eaDir", "day/@eaDir"]
+    images = scene.folder / "images"
+    if beside:
+        drop_colmap(scene)
+        write_transforms(scene)
+        for path in images.iterdir():
+            path.rename(scene.folder / path.name)
+        images.rmdir()
+        images = scene.folder
+        folders += ["masks-given", "masks-segments", "sfm/photos", "garden/views"]
+    for folder in folders:
+        (images / folder).mkdir(parents=True)
+        Image.new("RGB", (64, 48)).save(images / folder / f"{scene.names[0]}.png")
+    if beside:
+        (scene.folder / "garden" / "objectgs.json").write_text("{}")
+    assert not [text for text in check_capture(scene.folder)["warnings"] if "are not in the model" in text]
+    assert sorted(Photos(scene.folder).names) == sorted(scene.names)
 
 
 def test_photos_may_lie_beside_the_cameras(write_capture, tmp_path):

@@ -7,13 +7,26 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...shared.errors import InputError
-from ...shared.formats.photos_source import IMAGES
+from ...shared.formats.photos_source import IMAGES, WORK
+from ...shared.reconstruction.folder import Reconstruction
 from ..files import Files, image_size
+from ..made_masks import SEGMENTS, kept_masks
+
+_NO_PHOTOS = ("masks", kept_masks(Path()).name, SEGMENTS, WORK)
+"""Folders of a capture with images that are no photos."""
 
 
 def photos_folder(folder: Path) -> Path:
     """Return the folder of a capture's photos: images/ or, where there is none, the capture itself."""
     return folder / "images" if (folder / "images").is_dir() else folder
+
+
+def photo_files(capture: Path, folder: Path) -> Files:
+    """Return the files in the folder of a capture's photos; if it is the capture's own, without what is made there."""
+    if folder != capture:
+        return Files(folder)
+    settings = Reconstruction(capture).settings.name
+    return Files(folder, without=(*_NO_PHOTOS, *(path.parent.name for path in capture.glob(f"*/{settings}"))))
 
 
 def none_found(folder: Path, names: Sequence[str], file: Path) -> InputError:
@@ -43,7 +56,7 @@ class Photos:
 
     def __init__(self, capture: Path) -> None:
         self.folder = photos_folder(capture)
-        self._files = Files(self.folder, without=("masks",) if self.folder == capture else ())
+        self._files = photo_files(capture, self.folder)
         self.names = [path for path in self._files.paths if _split(path)[1]]
         self._by_stem: dict[str, list[str]] = {}
         self._by_name: dict[str, list[str]] = {}

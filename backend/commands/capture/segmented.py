@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from ...capture.made_masks import SEGMENTS
 from ...capture.mask_sources import MaskSource
 from ...capture.models import Photos
 from ...raster import devices
@@ -18,8 +19,6 @@ from ..setup.device import choose_device
 
 _MASKS = "MASKS"
 """The argument with the model, for errors."""
-_SEGMENTS = "masks-segments"
-"""Folder of the capture with the segments that models have found, so that a stopped command goes on."""
 _PER_PHOTO = 30.0
 """Expected seconds in which a model segments a photo, until its pace is known."""
 
@@ -40,7 +39,7 @@ def segmented(options: argparse.Namespace, names: Sequence[str], reporter: Stopp
         raise InputError("Segments do not say which of them show the same object; use --objects find.")
     images = Photos(options.capture).folder
     present = [name for name in names if (images / name).is_file()]
-    source = PhotoSegments(_finder(options), images, present, options.capture / _SEGMENTS)
+    source = PhotoSegments(_finder(options), images, present, options.capture / SEGMENTS)
     missing = len(source.missing())
     reporter.expect({part: ("Segmenting", max(_PER_PHOTO * missing, 1.0))})
     reporter.begin(part, f"Segmenting {missing} photos")
