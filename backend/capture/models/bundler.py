@@ -7,6 +7,7 @@ their own, one a line, in the cameras' order.
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -56,11 +57,12 @@ def read(file: Path) -> Model:
             f"{names[0]} names {len(names[1])} photos, but {file} has {cameras} cameras; export both again together."
         )
     poses = [lines.numbers(_LINES_OF_CAMERA, (3, 3, 3, 3, 3), "5 lines of a camera") for _ in range(cameras)]
-    xyz, rgb, views = np.empty((points, 3)), np.empty((points, 3), np.uint8), _Views(cameras)
-    for point in range(points):
-        xyz[point] = lines.row(3, "the position of a point")
-        rgb[point] = np.clip(np.nan_to_num(lines.row(3, "the color of a point")), 0, 255)
-        views.add(point, lines.row(None, "the views of a point"), lines)
+    # One NumPy array for each line would take most of the time.
+    xyz, rgb, views = array("d"), array("d"), _Views(cameras)
+    for _ in range(points):
+        xyz.extend(lines.row(3, "the position of a point"))
+        rgb.extend(lines.row(3, "the color of a point"))
+        views.add(lines.row(None, "the views of a point"), lines)
     unposed = 0
     for number, (name, row) in enumerate(zip(names[1], poses, strict=True)):
         if not row[0] and not row[3:12].any():
@@ -77,7 +79,9 @@ def read(file: Path) -> Model:
     if unposed:
         draft.warnings.append(f"{unposed} of {cameras} photos in {names[0]} have no pose in {file} and are left out.")
     if points:
-        return draft.finish(RawPoints(np.arange(points), xyz, rgb, np.full(points, -1.0)))
+        colors = np.clip(np.nan_to_num(np.array(rgb)), 0, 255).astype(np.uint8)
+        of_points = np.array(xyz).reshape(-1, 3), colors.reshape(-1, 3)
+        return draft.finish(RawPoints(np.arange(points), *of_points, np.full(points, -1.0)))
     return draft.finish_with_point_cloud()
 
 
@@ -113,10 +117,10 @@ class _Lines:
             raise self.malformed(expected)
         return line.strip()
 
-    def row(self, count: int | None, expected: str) -> np.ndarray:
-        """Return the numbers (count,) of the next line; any number of them for None."""
+    def row(self, count: int | None, expected: str) -> list[float]:
+        """Return the `count` numbers of the next line; any number of them for None."""
         try:
-            values = np.array(self.next(expected).split(), np.float64)
+            values = list(map(float, self.next(expected).split()))
         except ValueError as error:
             raise self.malformed(expected) from error
         if count is not None and len(values) != count:
@@ -130,7 +134,7 @@ class _Lines:
     def counts(self) -> tuple[int, int]:
         """Return the numbers of cameras and points, which the file must be long enough for."""
         expected = "the numbers of cameras and points"
-        row = self.row(2, expected)
+        row = np.array(self.row(2, expected))
         if not ((row >= 0) & (row == np.floor(row)) & np.isfinite(row)).all():
             raise self.malformed(expected)
         if row @ [_LINES_OF_CAMERA, _LINES_OF_POINT] > self._size:
@@ -143,28 +147,28 @@ class _Views:
 
     def __init__(self, cameras: int) -> None:
         self._cameras = cameras
-        self._rows: list[np.ndarray] = []
-        self._points: list[int] = []
+        self._rows = array("d")
+        self._counts: list[int] = []
         self._sorted: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def add(self, point: int, row: np.ndarray, lines: _Lines) -> None:
-        """Add a point's list of views: their number, then camera, key, x and y for each."""
-        if len(row) < 1 or len(row) != 1 + 4 * row[0]:
+    def add(self, row: list[float], lines: _Lines) -> None:
+        """Add the next point's list of views: their number, then camera, key, x and y for each."""
+        if not row or len(row) != 1 + 4 * row[0]:
             raise lines.malformed("the number of views of a point, and 4 numbers for each")
-        views = row[1:].reshape(-1, 4)
-        if not ((views[:, 0] >= 0) & (views[:, 0] < self._cameras)).all():
+        if not all(0 <= camera < self._cameras for camera in row[1::4]):
             raise lines.malformed(f"views with cameras from 0 to {self._cameras - 1}")
-        self._rows.append(views[:, [0, 2, 3]])
-        self._points += [point] * len(views)
+        self._rows.extend(row[1:])
+        self._counts.append(len(row) // 4)
 
     def of(self, camera: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixels (n, 2) and points (n,) that a camera observed."""
         if self._sorted is None:
-            rows = np.concatenate([*self._rows, np.zeros((0, 3))])
+            rows = np.array(self._rows).reshape(-1, 4)
+            points = np.repeat(np.arange(len(self._counts)), self._counts)
             cameras = rows[:, 0].astype(np.int64)
             order = np.argsort(cameras, kind="stable")
             starts = np.searchsorted(cameras[order], np.arange(self._cameras + 1))
-            self._sorted = rows[order, 1:], np.array(self._points, np.int64)[order], starts
+            self._sorted = rows[order, 2:], points[order], starts
         xy, points, starts = self._sorted
         mine = slice(starts[camera], starts[camera + 1])
         return xy[mine] * [1.0, -1.0] + [width / 2, height / 2], points[mine]
