@@ -397,6 +397,23 @@ def test_cameras_of_a_rig_without_an_own_pose_are_explained(write_capture, tmp_p
     )
 
 
+def test_two_images_that_fit_one_photo_are_refused_by_what_the_file_calls_them(write_capture):
+    scene = write_capture(views=4)
+    drop_colmap(scene)
+
+    def of_two_cameras(content):
+        for frame, place in zip(content["frames"], ("cam1/0.png", "cam2/0.png", "1.png", "2.png")):
+            frame["file_path"] = place
+
+    for number, name in enumerate(scene.names[:3]):
+        (scene.folder / "images" / name).rename(scene.folder / "images" / f"{number}.png")
+    write_transforms(scene, of_two_cameras)
+    with pytest.raises(
+        InputError, match=r"both cam1/0\.png and cam2/0\.png, which fit the same photo, 0\.png; put the"
+    ):
+        read_capture_model(scene.folder)
+
+
 def test_names_that_fit_several_photos_are_reported(write_capture, tmp_path):
     """Cameras number photos anew in each folder."""
     scene = write_capture(views=4)

@@ -337,6 +337,16 @@ def test_photos_that_nobody_has_annotated_get_no_mask(write, photos, tmp_path, r
     assert {each.name for each in (photos / "masks").glob("*.png")} == {f"{photo(n)}.png" for n in (0, 1)}
 
 
+@pytest.mark.parametrize("write", [write_coco_polygons, write_cvat_images, write_label_studio])
+def test_annotations_of_two_photos_that_fit_one_are_refused(write, photos, tmp_path):
+    """As of the cameras of a rig, of which the capture has one."""
+    path = write(tmp_path)
+    both = path.read_text().replace(photo(0), f"cam1/{photo(0)}").replace(photo(1), f"cam2/{photo(0)}")
+    path.write_text(both.replace("0123abcd-", ""))
+    with pytest.raises(InputError, match=f"names both .*cam1/{photo(0)} and .*cam2/{photo(0)}, which fit the same"):
+        open_source(path, photos, [photo(0), photo(1)])
+
+
 def test_photo_without_segments_does_not_refuse_the_others(photos, tmp_path):
     given = tmp_path / "given"
     given.mkdir()

@@ -16,7 +16,7 @@ import numpy as np
 from ...shared.errors import InputError
 from ...shared.formats.json_file import read_json
 from ..files import Files, read_mask
-from ..models.photos import Photos
+from ..models.photos import Photos, require_single
 from .segments import Segments, Shape, checked_size, draw_shapes, identity_of, polygon, run_lengths
 
 _TRACK = ("track_id", "instance_id", "object_id", "tracking_id")
@@ -50,16 +50,19 @@ class CocoMasks:
         self._annotations: dict[str, list[Mapping[str, Any]]] = {}
         try:
             self._names = {each["id"]: str(each["name"]) for each in content.get("categories", ())}
-            name_of = {}
+            name_of, reference_of = {}, {}
+            named: dict[str, str] = {}
             for image in content["images"]:
-                name = photos.find(str(image["file_name"]))
+                reference = str(image["file_name"])
+                name = photos.find(reference)
                 if name is not None:
-                    name_of[image["id"]] = name
+                    name_of[image["id"]], reference_of[image["id"]] = name, reference
                     self._sizes[name] = checked_size(image["width"], image["height"], f"{file}: {name}")
                     self._annotations[name] = []
             for annotation in content["annotations"]:
-                if annotation["image_id"] in name_of:
-                    self._annotations[name_of[annotation["image_id"]]].append(annotation)
+                if (image_id := annotation["image_id"]) in name_of:
+                    require_single(named, name_of[image_id], reference_of[image_id], file)
+                    self._annotations[name_of[image_id]].append(annotation)
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error
         # Photos that nobody has annotated yet are listed, too.

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...shared.errors import InputError
 from ...shared.formats.photos_source import natural_order
-from ..models.photos import Photos
+from ..models.photos import Photos, require_single
 from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turned
 
 _SHAPES = ("polygon", "box", "ellipse", "mask")
@@ -41,8 +41,7 @@ class CvatMasks:
             self._read_tracks(root, photos)
         except (TypeError, ValueError, KeyError) as error:
             raise self._invalid(error) from error
-        # Photos that nobody has annotated yet are listed, too.
-        self.photos: Sequence[str] = sorted(name for name, found in self._shapes.items() if found)
+        self.photos: Sequence[str] = sorted(self._shapes)
         self._is_unique = all(
             count == 1
             for found in self._shapes.values()
@@ -50,12 +49,19 @@ class CvatMasks:
         )
 
     def _read_images(self, root: Element, photos: Photos) -> None:
+        named: dict[str, str] = {}
         for image in root.iter("image"):
-            name = photos.find(image.get("name", ""))
-            if name is not None:
+            reference = image.get("name", "")
+            name = photos.find(reference)
+            shapes: list[tuple[Element, str, Hashable]] = [
+                (each, each.get("label", ""), None) for each in image if each.tag in _SHAPES
+            ]
+            # Photos that nobody has annotated yet are listed, too.
+            if name is not None and shapes:
+                require_single(named, name, reference, self._file)
                 width, height = int(image.attrib["width"]), int(image.attrib["height"])
                 self._sizes[name] = checked_size(width, height, f"{self._file}: {name}")
-                self._shapes[name] = [(each, each.get("label", ""), None) for each in image if each.tag in _SHAPES]
+                self._shapes[name] = shapes
 
     def _read_tracks(self, root: Element, photos: Photos) -> None:
         tracks = list(root.iter("track"))

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from ...shared.errors import InputError
-from ..models.photos import Photos
+from ..models.photos import Photos, require_single
 from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turned
 
 _UPLOAD = re.compile(r"^[0-9a-f]{8}-")
@@ -46,19 +46,20 @@ class LabelStudioMasks:
         self._file = file
         self._results: dict[str, list[Mapping[str, Any]]] = {}
         uploaded: dict[str, list[str]] = {}
+        named: dict[str, str] = {}
         for path in photos.names:
             uploaded.setdefault(_as_uploaded(path.rpartition("/")[2]), []).append(path)
         try:
             for task in content:
-                name = _photo_of(task, photos, uploaded)
-                if name is not None:
-                    self._results[name] = [
-                        each for annotation in task["annotations"] for each in _regions(annotation["result"])
-                    ]
+                name, reference = _photo_of(task, photos, uploaded)
+                regions = [each for annotation in task["annotations"] for each in _regions(annotation["result"])]
+                # Photos that nobody has annotated yet are listed, too.
+                if name is not None and regions:
+                    require_single(named, name, reference, file)
+                    self._results[name] = regions
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error
-        # Photos that nobody has annotated yet are listed, too.
-        self.photos: Sequence[str] = sorted(name for name, found in self._results.items() if found)
+        self.photos: Sequence[str] = sorted(self._results)
         self._is_unique = all(
             count == 1 for found in self._results.values() for count in Counter(map(_label, found)).values()
         )
@@ -80,8 +81,8 @@ class LabelStudioMasks:
         return InputError(f"{self._file} is not valid{where} ({error}); export it again from Label Studio as JSON.")
 
 
-def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Sequence[str]]) -> str | None:
-    """Return the photo of a task.
+def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Sequence[str]]) -> tuple[str | None, str]:
+    """Return the photo of a task, and what it is called there; None if there is no such photo.
 
     Args:
         task: the task.
@@ -97,8 +98,8 @@ def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Se
             fitting = uploaded.get(_UPLOAD.sub("", name), ())
             found = fitting[0] if len(fitting) == 1 else None
         if found is not None:
-            return found
-    return None
+            return found, value
+    return None, ""
 
 
 def _regions(results: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:

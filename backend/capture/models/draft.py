@@ -13,7 +13,7 @@ from ...shared.formats.json_file import LARGEST
 from ...shared.formats.regular_file import read_regular
 from ..colmap import Camera, Model, RawImage, RawPoints, export_again, validate
 from .lens import Lens
-from .photos import Photos, none_found
+from .photos import Photos, none_found, require_single
 from .point_cloud import find_point_cloud, read_point_cloud, seen_in
 from .visibility import color_agreement, with_observations
 
@@ -51,6 +51,7 @@ class Draft:
         self._ambiguous: list[tuple[str, Sequence[str]]] = []
         self._cameras: dict[tuple[Lens, int, int], Camera] = {}
         self._images: list[RawImage] = []
+        self._named: dict[str, str] = {}
 
     def refusal(self, why: str) -> InputError:
         """Return the error for a damaged file; `why` follows its name."""
@@ -84,7 +85,7 @@ class Draft:
             observed: Returns pixels (n, 2) and point IDs (n,) of an image with this width and height.
 
         Raises:
-            InputError: The pose is not one of a camera, or the photo cannot be read.
+            InputError: The pose is not one of a camera, or the photo cannot be read or fits another image, too.
         """
         shown = shorten(reference)
         fitting = self.photos.fitting(reference)
@@ -94,6 +95,7 @@ class Draft:
                 self._ambiguous.append((shown, fitting))
             return
         name = fitting[0]
+        require_single(self._named, name, shown, self.file)
         width, height = size or self.photos.size(name)
         key = (lens(width, height), width, height)
         if key not in self._cameras:

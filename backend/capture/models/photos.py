@@ -42,6 +42,23 @@ def none_found(folder: Path, names: Sequence[str], file: Path) -> InputError:
     )
 
 
+def require_single(named: dict[str, str], photo: str, reference: str, file: Path) -> None:
+    """Note what a file calls a photo; raise InputError if it called it otherwise before, as of two cameras of a rig.
+
+    Args:
+        named: What the file has called each photo so far, by their names.
+        photo: The name of the photo.
+        reference: What the file calls it.
+        file: The file.
+    """
+    other = named.setdefault(photo, reference)
+    if other != reference:
+        raise InputError(
+            f"{file} names both {other} and {reference}, which fit the same photo, {photo}; put the photos into the "
+            "folders that they have there, or remove one of the two from the file."
+        )
+
+
 class Photos:
     """The photos of a capture.
 
