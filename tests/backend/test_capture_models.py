@@ -858,6 +858,15 @@ def test_bad_csv_files_are_refused(write_capture, run_command, tmp_path, what):
         assert_refused(run_command, scene.folder, tmp_path, "cameras.csv", "UTF-8")
 
 
+def test_camera_without_focal_length_is_refused(write_capture):
+    scene = write_capture(views=4, model="OPENCV", params=[90.0, 90.0, 47.0, 36.5, 0.0, 0.0, 0.0, 0.0])
+    drop_colmap(scene)
+    path = write_realityscan(scene)
+    path.write_text(re.sub(r"(view_002.png(,[^,]*){6}),[^,]*", r"\1,0", path.read_text("utf-8-sig")))
+    with pytest.raises(InputError, match="a focal length of 0"):
+        read_capture_model(scene.folder)
+
+
 BOMB = (
     '<!DOCTYPE document [<!ENTITY a "aaaaaaaaaa">'
     + "".join(f'<!ENTITY {chr(98 + i)} "{f"&{chr(97 + i)};" * 10}">' for i in range(9))

@@ -76,7 +76,7 @@ def validate(model: Model, raw: list[RawImage]) -> Model:
 
 
 def check_camera(camera: Camera, path: Path, again: str) -> None:
-    """Raise InputError if a camera of the file `path` has an impossible size or parameters that are not finite.
+    """Raise InputError if a camera of the file `path` has an impossible size or parameters that no lens has.
 
     Args:
         camera: The camera.
@@ -88,6 +88,8 @@ def check_camera(camera: Camera, path: Path, again: str) -> None:
         raise InputError(f"{who} the impossible size {camera.width}x{camera.height}; {again}.")
     if not all(math.isfinite(value) for value in camera.params):
         raise InputError(f"{who} parameters that are not numbers (NaN or infinite); {again}.")
+    if camera.model != "EQUIRECTANGULAR" and not camera.params[0]:
+        raise InputError(f"{who} a focal length of 0; {again}.")
 
 
 def _compute_viewmat(image: RawImage, path: Path, again: str) -> np.ndarray:
