@@ -156,8 +156,8 @@ class Capture:
 
         Args:
             indices: The views.
-            correct: Returns the corrected mask (H, W) int64 for a view's index and its mask; negative IDs are of no
-                known object.
+            correct: Returns the corrected mask (H, W) int64 for a view's index and its mask, both with the objects that
+                are left out; negative IDs are of no known object.
         """
         other = copy.copy(self)
         other._corrected, other._correct, other._packed = indices, correct, {}
@@ -320,7 +320,7 @@ class Capture:
         """
         if (packed := self._packed.get(index)) is not None:
             return packed.unpacked()
-        mask = self.uncorrected_mask(index)
+        mask = self.edited({}, ()).uncorrected_mask(index)
         assert mask is not None and self._correct is not None
         ids = self._correct(index, mask)
         bounds = (np.min_scalar_type(int(each)) for each in (ids.min(initial=0), ids.max(initial=0)))

@@ -82,10 +82,10 @@ def correct_masks(
     """Correct the masks of training and validation views where they contradict the votes.
 
     Args:
-        capture: the capture; must be prepared. Without the objects that are left out, it is corrected all the same.
+        capture: the capture; must be prepared. The masks of objects that are left out are judged as those of others.
         point_ids: (M,) int64, the objects of the capture's points by the votes of all objects.
         ignore_gaps: whether unlabeled pixels where objects should be are ignored, since other unlabeled pixels are
-            supervised to show no object.
+            supervised to show no object. So are those of objects that are left out, which are no gaps.
         check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
@@ -94,29 +94,30 @@ def correct_masks(
     """
     # Validation views are trained on in the end.
     views = (*capture.train_indices, *capture.validation_indices)
+    whole, ids_of_gaps = capture.edited({}, ()), capture.without_left_out(point_ids)
     wrong = {}
     wrong_in: Counter[int] = Counter()
     right_in: Counter[int] = Counter()
     for index in views:
         check()
-        wrong[index] = [region.object_id for region in _regions(capture, index, point_ids) if region.is_wrong]
+        wrong[index] = [region.object_id for region in _regions(whole, index, point_ids) if region.is_wrong]
         wrong_in.update(set(wrong[index]))
-        right_in.update(_confirmed(capture, index, point_ids) - set(wrong[index]))
+        right_in.update(_confirmed(whole, index, point_ids) - set(wrong[index]))
     kept = {each for each, views in wrong_in.items() if views > _MOSTLY_WRONG * (views + right_in[each])}
     wrong = {index: left for index, ids in wrong.items() if (left := [i for i in ids if i not in kept])}
 
     def correct(index: int, mask: np.ndarray) -> np.ndarray:
         result = mask.astype(np.int64)
         if index in wrong:
-            for region in _regions(capture, index, point_ids):
+            for region in _regions(whole, index, point_ids):
                 if region.object_id in wrong[index] and region.is_wrong:
                     result[region.window][region.inside] = region.corrected()
         if ignore_gaps:
-            result[_gaps(capture, index, mask, point_ids)] = IGNORED
+            result[_gaps(whole, index, mask, ids_of_gaps)] = IGNORED
         return result
 
     regions = sum(map(len, wrong.values()))
-    changed = {index for index in views if 0 in capture.ids_in(index)} if ignore_gaps else set()
+    changed = {index for index in views if 0 in whole.ids_in(index)} if ignore_gaps else set()
     changed |= set(wrong)
     return (capture.with_corrected_masks(frozenset(changed), correct) if changed else capture), regions
 

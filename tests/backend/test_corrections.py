@@ -174,3 +174,21 @@ def test_gaps_are_ignored_and_background_is_not(write_capture, tmp_path):
     assert (found[background] == 0).mean() > 0.85
     assert (correct_masks(capture, ids, ignore_gaps=False)[0].mask(index) != IGNORED).all()
     assert (found[exact == SECOND] == IGNORED).mean() > 0.9
+
+
+def test_objects_that_are_left_out_are_background_and_gaps_beside_others_are_not(scene, tmp_path):
+    """Of the first sphere's mask in one view, a line beside the second is missing; in another the two are exchanged."""
+    before = load_capture(scene.folder, tmp_path / "cache")
+    beside = {i: ndimage.binary_dilation((m := before.mask(i)) == FIRST) & (m == SECOND) for i in before.train_indices}
+    cut = max(beside, key=lambda index: beside[index].sum())
+    swapped = next(index for index in beside if index != cut)
+    rewrite(mask_path(scene, cut), lambda mask: mask.__setitem__(beside[cut], 0))
+    rewrite(mask_path(scene, swapped), exchange)
+    capture, ids = loaded(scene, tmp_path, "again")
+    corrected, _ = correct_masks(capture.edited({}, [SECOND, THIRD]), ids, ignore_gaps=True)
+    assert beside[cut].sum() > 10 and (corrected.mask(cut)[beside[cut]] == IGNORED).mean() > 0.8
+    for index in capture.train_indices:
+        exact, found = before.mask(index), corrected.mask(index)
+        assert (found[np.isin(exact, (SECOND, THIRD)) & ~beside[index]] == 0).mean() > 0.9
+        assert (found[exact == FIRST] == FIRST).mean() > 0.9
+        assert (found[exact == 0] == 0).mean() > 0.9
