@@ -9,7 +9,9 @@ import torch
 
 from ..model.anchors import Layout
 from ..model.generate import Generated
+from ..model.object_model import ObjectModel
 from ..raster import devices
+from ..shared.reconstruction.objects import default_name
 from .optimizer.adam import LARGEST_GRADIENT
 
 BRIGHTEST = 1e9
@@ -40,6 +42,13 @@ class Fault(NamedTuple):
     anchors: torch.Tensor
     splat: int | None
     unrecoverable: torch.Tensor
+
+    def owner(self, model: ObjectModel, names: Mapping[int, str]) -> str | None:
+        """Return the name of the first anchor's object, of those in `names` by ID; None if no anchor is known."""
+        if not len(self.anchors):
+            return None
+        object_id = int(model.classes.ids_of(int(model.anchors.ids[self.anchors[0]])))
+        return names.get(object_id, default_name(object_id) if object_id else "no object")
 
     def sentence(self, step: int, view: str, owner: str | None) -> str:
         """Return a warning for the user; owner: the name of the first anchor's object."""

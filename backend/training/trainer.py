@@ -23,7 +23,6 @@ from ..raster import devices
 from ..shared.durations import awake_seconds
 from ..shared.errors import Cancelled, InputError, ProcessLost
 from ..shared.events import Reporter
-from ..shared.reconstruction.objects import default_name
 from ..shared.stopping import Check, StopRequest, proceed
 from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress, objective_of, plateau_end
@@ -258,7 +257,11 @@ class Trainer:
         p = self.progress
         before, first_step = p.seconds, p.step
         budget.begin(p)
-        capture, validation = self.scene.capture, self.scene.capture.validation_indices
+        capture, validation, earlier = self.scene.capture, self.scene.capture.validation_indices, copy.copy(p)
+        if self.region.is_whole and not budget.until_converged:
+            # They decide on nothing. Those of a cell need not show it.
+            p.join(validation)
+            begin_colors(self.view_step.colors, self.shown, self.scene, p.joining(earlier, validation))
         if evaluate is not None and not p.step and not validation:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
@@ -409,12 +412,9 @@ class Trainer:
 
     def _note(self, fault: check_finite.Fault, index: int) -> None:
         """Count a fault in the step on view `index`, and warn if it is the first of its kind."""
-        p, model, capture = self.progress, self.model, self.scene.capture
+        p, capture = self.progress, self.scene.capture
         if fault.what not in p.faults:
-            owner = None
-            if len(fault.anchors):
-                object_id = int(model.classes.ids_of(int(model.anchors.ids[fault.anchors[0]])))
-                owner = capture.names.get(object_id, default_name(object_id) if object_id else "no object")
+            owner = fault.owner(self.model, capture.names)
             self._warnings.append(fault.sentence(p.step, capture.views[index].name, owner))
         p.faults[fault.what] = p.faults.get(fault.what, 0) + 1
 

@@ -35,6 +35,7 @@ from backend.shared.stopping import StopRequest
 from backend.training.budget import Budget
 from backend.training.cells.region import EVERYWHERE, Region
 from backend.training.extent import pixel_size
+from backend.training.fine_tuning.fit_discs import begin_discs
 from backend.training.initial_model import initial_model
 from backend.training.losses.on_cpu import PROBABILITY_FLOOR, image_loss, normal_loss, volume_loss
 from backend.training.optimizer.adam import BETA1, BETA2, step_rows
@@ -42,6 +43,7 @@ from backend.training.optimizer.average import EVERY, FRACTION, MAX_STEPS, Avera
 from backend.training.scene import Scene
 from backend.training.settings import Settings
 from backend.training.state import blur_warning, load_model
+from backend.training.step import ViewStep
 from backend.training.trainer import Trainer
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -590,6 +592,36 @@ def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
     other = Trainer.start(capture, ids, Settings(offsets=4, sh_degree=1, seed=1))
     other.run(Budget(steps=40), tmp_path / "d", Reporter())
     assert not np.array_equal(whole.model.anchors.rows, other.model.anchors.rows)
+
+
+def test_validation_views_are_trained_on_where_the_length_is_known(tiny, tmp_path, monkeypatch):
+    """After a training until convergence that was stopped, and by its discs; not in a cell."""
+    capture, ids = tiny()
+    capture = capture.validating_on([capture.views[index].name for index in capture.train_indices[::3]])
+    trained, compute = [], ViewStep.compute
+
+    def computing(self, index, *args, **options):
+        trained.append(index)
+        return compute(self, index, *args, **options)
+
+    class StopLater(StopRequest):
+        def __call__(self):
+            return len(trained) >= 8
+
+    monkeypatch.setattr(ViewStep, "compute", computing)
+    first = Trainer.start(capture, ids, dataclasses.replace(SMALL, fit_colors=True))
+    with pytest.raises(Cancelled):
+        first.run(Budget(until_converged=True), tmp_path, Reporter(), stop=StopLater())
+    assert set(trained) == set(capture.train_indices)
+    model, _, _ = load_model(tmp_path)
+    discs = begin_discs(model, capture, tmp_path, 100, np.ones((len(capture), 3)))
+    resumed, _ = Trainer.resume(capture, tmp_path)
+    cell, _ = Trainer.resume(capture, tmp_path)
+    cell.region = Region(bounds=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
+    for trainer, views in ((discs, capture.validation_indices), (resumed, capture.validation_indices), (cell, ())):
+        trained.clear()
+        trainer.run(Budget(steps=trainer.progress.step + 10), tmp_path / "out", Reporter())
+        assert set(trained) == {*capture.train_indices, *views} and trainer.progress.joined is bool(views)
 
 
 def test_steps_without_a_loss_do_not_change_the_smooth_loss(tiny, tmp_path, monkeypatch):

@@ -74,4 +74,5 @@ def begin_discs(model: ObjectModel, capture: Capture, checkpoint: Path, memory_m
     trainer = Trainer(scene, settings, discs, np.random.default_rng(settings.seed))
     trainer.view_step.restore(tensors)
     trainer.progress.dropped = state["progress"].get("dropped", 0.0)
+    trainer.progress.joined = state["progress"].get("joined", False)
     return trainer
