@@ -26,6 +26,7 @@ from ..shared.errors import (
     ProcessLost,
     describe_missing_package,
     is_lack_of_memory,
+    is_lack_of_space,
 )
 from ..shared.events import JsonReporter, Reporter, StagedReporter
 from ..shared.signals import held_signals
@@ -183,7 +184,7 @@ def _describe_error(error: Exception, trains: bool) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         return describe_missing_package(error)
     if isinstance(error, OSError) and error.filename:
-        full = error.errno in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None))
+        full = is_lack_of_space(error)
         problem = "could not be written" if full else "cannot be used"
         advice = "free some space and run the same command again" if full else "check it and its permissions"
         return f"{error.filename} {problem} ({error.strerror}); {advice}."

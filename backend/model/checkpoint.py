@@ -13,7 +13,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ..shared.errors import InputError
+from ..shared.durations import awake_seconds
+from ..shared.errors import InputError, is_lack_of_space
+from ..shared.events import Reporter
 from ..shared.formats.atomic import atomic_file, make_folder, replace_file
 from ..shared.formats.json_file import parse_json
 from ..shared.formats.regular_file import open_regular
@@ -121,9 +123,12 @@ def save_checkpoint(
                 os.fsync(file.fileno())
                 replace_file(folder / CURRENT, folder / PREVIOUS)
     except OSError as error:
+        advice = (
+            "free some space" if is_lack_of_space(error) else "close programs that use it, or check its permissions,"
+        )
         raise InputError(
-            f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); free some space and run "
-            "the same command again to continue from the previous checkpoint."
+            f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); {advice} and run the same "
+            "command again to continue from the previous checkpoint."
         ) from error
 
 
@@ -152,6 +157,57 @@ def _write(file: BinaryIO, tensors: dict[str, np.ndarray], metadata: dict[str, s
 def seconds_to_next(least: float, saving: float) -> float:
     """Return the seconds to train until the next checkpoint: `least`, or more if the last one took long to save."""
     return max(least, min(_SHARE * saving, _LONGEST))
+
+
+class Saving:
+    """Saves a training at intervals, which are longer where that takes long.
+
+    Args:
+        save: writes a checkpoint to a folder; raises InputError if it cannot.
+        folder: folder of the checkpoints.
+        least: least number of seconds between them.
+        reporter: receives a warning where one at an interval cannot be written.
+    """
+
+    def __init__(self, save: Callable[[Path], None], folder: Path, least: float, reporter: Reporter) -> None:
+        self._save, self._folder, self._least, self._reporter = save, folder, least, reporter
+        self._last, self._interval = awake_seconds(), least
+        self._failed = False
+
+    def save(self) -> None:
+        """Write a checkpoint; the interval to the next one begins.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        self._save(self._folder)
+        self._last, self._failed = awake_seconds(), False
+
+    def save_if_due(self) -> None:
+        """Write a checkpoint if the interval is over; one that cannot be written is left for the next interval.
+
+        Raises:
+            InputError: nor could the one before.
+        """
+        started = awake_seconds()
+        if started - self._last < self._interval:
+            return
+        try:
+            self.save()
+        except InputError as error:
+            if self._failed:
+                raise
+            self._last, self._failed = awake_seconds(), True
+            reason = error.__cause__.strerror if isinstance(error.__cause__, OSError) else error
+            self._reporter.warning(
+                f"{self._folder}: a checkpoint could not be written ({reason}); the training goes on, and tries again "
+                "later."
+            )
+        self._interval = seconds_to_next(self._least, self._last - started)
+
+    def delay(self, seconds: float) -> None:
+        """Do not count a time in which the training has waited."""
+        self._last += seconds
 
 
 def has_checkpoint(folder: Path) -> bool:

@@ -54,6 +54,11 @@ def is_lack_of_memory(error: BaseException) -> bool:
     return lacks or _UNALLOCATED.search(str(error)) is not None
 
 
+def is_lack_of_space(error: OSError) -> bool:
+    """Return whether an error means that a disk is full, or that a file would be larger than it may be."""
+    return error.errno in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None))
+
+
 def describe_missing_package(error: ModuleNotFoundError) -> str:
     """Return the message for a Python without the backend's packages."""
     return (

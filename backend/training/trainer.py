@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from ..model.checkpoint import save_checkpoint, seconds_to_next
+from ..model.checkpoint import Saving, save_checkpoint
 from ..model.object_model import ObjectModel
 from ..raster import devices
 from ..shared.durations import awake_seconds
@@ -224,7 +224,8 @@ class Trainer:
 
         Args:
             budget: total length of the training.
-            checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals.
+            checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals, where
+                one may fail.
             reporter: receives progress, quality and warnings.
             evaluate: function that measures the model on held-out and validation views, and may leave out the former.
             stop: stop and pause request, checked before each step.
@@ -265,8 +266,8 @@ class Trainer:
         if evaluate is not None and not p.step and not validation:
             p.watched = overfitting.choose_watched_views(capture.train_indices, len(capture.points.xyz))
         self._team.tell_state(p.__dict__)  # Returns when the others are ready.
-        started = last_saved = last_report = awake_seconds()
-        parts, until_next = self.parts, checkpoint_seconds
+        started = last_report = awake_seconds()
+        parts, saving = self.parts, Saving(self.save, checkpoints, checkpoint_seconds, reporter)
         while True:
             p.seconds = before + awake_seconds() - started
             if evaluate is not None and budget.evaluation_is_due(p):
@@ -283,12 +284,12 @@ class Trainer:
             if progress >= 1.0:
                 break
             if stop.paused:
-                self.save(checkpoints)
-                last_saved = awake_seconds()
+                saving.save()
             wait_started = awake_seconds()
             stopped = stop()
             waited = awake_seconds() - wait_started
-            started, last_saved, last_report = started + waited, last_saved + waited, last_report + waited
+            started, last_report = started + waited, last_report + waited
+            saving.delay(waited)
             if stopped:
                 self.save(checkpoints)
                 raise Cancelled(f"Stopped after {p.step} steps; run the same command again to resume.")
@@ -307,10 +308,7 @@ class Trainer:
                 p.seconds = before + now - started
                 self._report(budget, reporter, float(self._smooth), (now - started) / (p.step - first_step))
                 self.optimizer.check.watch()
-            if now - last_saved >= until_next:
-                self.save(checkpoints)
-                last_saved = awake_seconds()
-                until_next = seconds_to_next(checkpoint_seconds, last_saved - now)
+            saving.save_if_due()
         self.save(checkpoints)
         if p.skipped:
             reporter.warning(f"{p.skipped} updates were not finite and were skipped{p.causes and f': {p.causes}'}.")

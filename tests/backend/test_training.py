@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import functools
 import math
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from backend.commands.setup import machine
 from backend.commands.training import memory
+from backend.model import checkpoint
 from backend.model.anchors import Anchors, Layout, cell_keys, median_spacing, seed_anchors
 from backend.model.checkpoint import CURRENT, PREVIOUS, load_checkpoint, save_checkpoint, seconds_to_next
 from backend.model.draw import draw
@@ -562,6 +564,35 @@ def test_checkpoints_that_take_long_are_rare(tiny, tmp_path, monkeypatch):
     assert saved == [1, 6]
     assert [seconds_to_next(30.0, seconds) for seconds in (0.1, 10.0, 100.0)] == [30.0, 200.0, 600.0]
     assert seconds_to_next(1000.0, 100.0) == 1000.0
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_one_checkpoint_at_an_interval_may_fail(tiny, tmp_path, monkeypatch, failing):
+    """But not two in a row."""
+    trainer, saved, warnings, reporter = Trainer.start(*tiny(), SMALL), [], [], Reporter()
+
+    def replace(part, path):
+        saved.append(trainer.progress.step)
+        if path.name == PREVIOUS and len(saved) in (4, 4 + failing - 1):
+            raise PermissionError(13, "It is being used by another process")
+        part.replace(path)
+
+    def step(_):
+        trainer.progress.step += 1
+        return torch.tensor(1.0)
+
+    monkeypatch.setattr(checkpoint, "replace_file", replace)
+    monkeypatch.setattr(trainer, "step", step)
+    monkeypatch.setattr(checkpoint, "seconds_to_next", lambda *_: 0.0)
+    reporter.warning = warnings.append
+    run = functools.partial(trainer.run, Budget(steps=6), tmp_path, reporter, checkpoint_seconds=0.0)
+    if failing == 1:
+        run()
+    else:
+        with pytest.raises(InputError, match="close programs that use it"):
+            run()
+    assert len(warnings) == 1 and str(tmp_path) in warnings[0] and "used by another process" in warnings[0]
+    assert load_checkpoint(tmp_path)[1]["progress"]["step"] == trainer.progress.step == 6
 
 
 def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
