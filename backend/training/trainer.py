@@ -21,7 +21,7 @@ from ..model.checkpoint import Saving, save_checkpoint
 from ..model.object_model import ObjectModel
 from ..raster import devices
 from ..shared.durations import awake_seconds
-from ..shared.errors import Cancelled, InputError, ProcessLost
+from ..shared.errors import Cancelled, InputError, ProcessLost, is_lack_of_memory
 from ..shared.events import Reporter
 from ..shared.stopping import Check, StopRequest, proceed
 from . import check_finite, overfitting
@@ -234,15 +234,17 @@ class Trainer:
         Raises:
             Cancelled: a stop was requested; the training is saved.
             InputError, OSError: an image cannot be read or a file cannot be written; the steps so far are saved if
-                possible.
+                possible, as for errors that tell a lack of memory.
             ProcessLost: another process of the training has ended; the steps so far are saved.
         """
         first_step = self.progress.step
         try:
             self._train(budget, checkpoints, reporter, evaluate, stop or StopRequest(), checkpoint_seconds)
-        except (InputError, OSError, ProcessLost):
-            if self.progress.step > first_step:
-                with suppress(InputError, OSError):
+        except Exception as error:
+            expected = isinstance(error, (InputError, OSError, ProcessLost)) or is_lack_of_memory(error)
+            if expected and self.progress.step > first_step and self.optimizer.is_complete:
+                self.scene.forget()
+                with suppress(InputError, OSError, MemoryError):
                     self.save(checkpoints)
             raise
 
@@ -335,9 +337,7 @@ class Trainer:
             loss=round(loss, 5) if math.isfinite(loss) else None,
             anchors=len(self.model.anchors),
             splats=self.splats,
-            psnr=latest.get("psnr"),
-            miou=latest.get("miou"),
-            miou_all=latest.get("miou_all"),
+            **{name: latest.get(name) for name in ("psnr", "miou", "miou_all")},
             zero_is_background=self.scene.supervise_background,
         )
 

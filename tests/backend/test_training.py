@@ -595,6 +595,28 @@ def test_one_checkpoint_at_an_interval_may_fail(tiny, tmp_path, monkeypatch, fai
     assert load_checkpoint(tmp_path)[1]["progress"]["step"] == trainer.progress.step == 6
 
 
+@pytest.mark.parametrize("where", ["a view", "growth"])
+def test_steps_before_a_lack_of_memory_are_saved(tiny, tmp_path, monkeypatch, where):
+    """But not a model whose anchors have changed in part."""
+    trainer = Trainer.start(*tiny(), SMALL)
+    trainer.save(tmp_path)
+    compute = trainer.view_step.compute
+
+    def computing(*args, **options):
+        if trainer.progress.step < 3:
+            return compute(*args, **options)
+        if where == "growth":
+            anchors = trainer.model.anchors
+            anchors.positions, anchors.rows, anchors.ids = anchors.positions[1:], anchors.rows[1:], anchors.ids[1:]
+        raise MemoryError("Unable to allocate 450 MiB")
+
+    monkeypatch.setattr(trainer.view_step, "compute", computing)
+    with pytest.raises(MemoryError):
+        trainer.run(Budget(steps=6), tmp_path, Reporter())
+    resumed, warning = Trainer.resume(trainer.scene.capture, tmp_path)
+    assert warning is None and resumed.progress.step == (0 if where == "growth" else 3)
+
+
 def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
     capture, ids = tiny()
     whole = Trainer.start(capture, ids, SMALL)

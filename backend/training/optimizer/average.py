@@ -37,11 +37,14 @@ class Average:
         model: the model.
         fixed: number of anchors, the first ones, that do not change and of which no mean is kept.
         rows: (n, columns), the mean of the other anchors' rows, if it is known.
+
+    Attributes:
+        rows: (n, columns), that mean.
     """
 
     def __init__(self, model: ObjectModel, fixed: int = 0, rows: torch.Tensor | None = None) -> None:
         self._fixed = fixed
-        self._rows = model.anchors.rows[fixed:].clone() if rows is None else rows
+        self.rows = model.anchors.rows[fixed:].clone() if rows is None else rows
         self._heads = copy.deepcopy(model.heads).requires_grad_(False)
         self._background = model.background.detach().clone()
 
@@ -50,7 +53,7 @@ class Average:
         if step % EVERY:
             return
         weight = EVERY / max(min(FRACTION * step, MAX_STEPS), EVERY)
-        self._rows.lerp_(model.anchors.rows[self._fixed :], weight)
+        self.rows.lerp_(model.anchors.rows[self._fixed :], weight)
         self._background.lerp_(model.background.detach(), weight)
         for mean, parameter in zip(self._heads.parameters(), model.heads.parameters(), strict=True):
             mean.lerp_(parameter.detach(), weight)
@@ -62,18 +65,18 @@ class Average:
             kept: (n,) int64, indices of the rows that are kept, not counting those of fixed anchors.
             new: (m, columns), rows that are appended.
         """
-        self._rows = kept_and_added(self._rows, kept, new)
+        self.rows = kept_and_added(self.rows, kept, new)
 
     def of(self, model: ObjectModel) -> ObjectModel:
         """Return the mean as a model; `model` is the model in training."""
         fixed = model.anchors.rows[: self._fixed]
-        anchors = replace(model.anchors, rows=torch.cat([fixed, self._rows]) if self._fixed else self._rows)
+        anchors = replace(model.anchors, rows=torch.cat([fixed, self.rows]) if self._fixed else self.rows)
         return replace(model, anchors=anchors, heads=self._heads, background=self._background)
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the mean as tensors for a checkpoint."""
         heads = {f"heads.{name}": value for name, value in self._heads.state_dict().items()}
-        values = {"rows": self._rows, "background": self._background, **heads}
+        values = {"rows": self.rows, "background": self._background, **heads}
         return {PREFIX + name: value for name, value in values.items()}
 
     @classmethod

@@ -55,6 +55,13 @@ class ModelOptimizer:
         self.growth = GrowthStrategy(settings, model, region, tensors)
         self.check = FiniteCheck(model.device)
 
+    @property
+    def is_complete(self) -> bool:
+        """Whether all parts have the same anchors, unlike after a growth or a removal that has failed half way."""
+        a, fixed = self._model.anchors, self._region.fixed
+        trained = [len(values) + fixed for values in (self.rows.exp_avg, self.rows.exp_avg_sq, self.average.rows)]
+        return len({len(a.positions), len(a.rows), len(a.ids), len(self.growth.statistics.views), *trained}) == 1
+
     def update(self, gradients: ViewGradients, progress: float, step: int) -> None:
         """Update the model with the gradients of a view.
 
