@@ -75,6 +75,18 @@ def test_end_and_deciding_views_are_always_measured(clock, tmp_path):
     assert figures["psnr"] > 0 and clock.drawn[3:] == list(HELD_OUT)
 
 
+def test_previews_that_cannot_be_written_are_reported_once(clock, tmp_path, monkeypatch):
+    def save(image, path, quick):
+        raise PermissionError(13, "It is being used by another process", str(path))
+
+    monkeypatch.setattr(measuring, "save_image", save)
+    reporter, warnings, previews = Reporter(), [], []
+    reporter.warning, reporter.preview = warnings.append, lambda *path, **_: previews.append(path)
+    measure = Measuring(SimpleNamespace(previews=tmp_path), Budget(steps=10), reporter)
+    assert all(measure(None, scene(), TrainingProgress(step=10))["psnr"] > 0 for _ in range(2))
+    assert len(warnings) == 1 and "render.png could not be written (It is being used" in warnings[0] and not previews
+
+
 def test_preview_of_a_training_view_has_no_object_for_unknown_pixels(clock, tmp_path, monkeypatch):
     without = scene()
     without.capture.test_indices = ()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL.Image import Image
 
 from ...evaluation import IdScores, color_corrected, comparison, curve_image, psnr, save_image, thumbnail
 from ...model.draw import draw
@@ -35,6 +37,7 @@ class Measuring:
         self._budget = budget
         self._reporter = reporter
         self._spent = 0.0
+        self._warned = False
 
     def __call__(self, model: ObjectModel, scene: Scene, progress: TrainingProgress) -> dict[str, Any]:
         """Return the figures of the views that are measured now."""
@@ -56,8 +59,21 @@ class Measuring:
                 figures[name] = float(np.mean(found))
         curve = curve_image([*progress.curve, {"seconds": progress.seconds, **figures}])
         if curve is not None:
-            save_image(curve, self._folder.previews / "curve.png", quick=True)
+            self._save(curve, "curve.png")
         return figures
+
+    def _save(self, image: Image, name: str) -> Path | None:
+        """Write a preview and return its path; None if that is impossible, which is reported once."""
+        path = self._folder.previews / name
+        try:
+            return save_image(image, path, quick=True)
+        except OSError as error:
+            if not self._warned:
+                self._reporter.warning(
+                    f"{path} could not be written ({error.strerror}); the training goes on without it."
+                )
+            self._warned = True
+            return None
 
     def _held_out(self, model: ObjectModel, scene: Scene, allowed: float) -> dict[str, Any]:
         """Measure the held-out views, or only draw the first if all would take more than `allowed` seconds."""
@@ -79,9 +95,9 @@ class Measuring:
                 # Where no view is held out, it is a training view, whose corrected mask has pixels without an ID.
                 shown = None if truth is None else np.maximum(truth, 0)
                 preview = comparison(photo, rendered.image, shown, rendered.ids, None, capture.names)
-                render = save_image(thumbnail(rendered.image), self._folder.previews / "render.png", quick=True)
-                latest = save_image(preview, self._folder.previews / "latest.png", quick=True)
-                self._reporter.preview(latest, render=render)
+                render, latest = self._save(thumbnail(rendered.image), "render.png"), self._save(preview, "latest.png")
+                if render is not None and latest is not None:
+                    self._reporter.preview(latest, render=render)
                 if (time.monotonic() - started) * len(indices) > allowed:
                     return {}
         scores = ids.result()
