@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ import torch
 from backend.capture import load_capture
 from backend.commands.training import train
 from backend.shared.errors import EXIT_DONE
+from backend.shared.events import Reporter
 from backend.training import initial_model
+from backend.training.budget import Budget
 from backend.training.initial_model import FEWEST_ANCHORS, affordable_anchors
 from backend.training.settings import Settings
 from backend.training.step import ViewStep
@@ -82,6 +85,16 @@ def test_measuring_a_step_changes_nothing(tiny):
     assert torch.equal(trainer.model.anchors.rows, same.model.anchors.rows)
     pairs = zip(trainer.model.heads.parameters(), same.model.heads.parameters(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_steps_may_take_no_time(monkeypatch):
+    monkeypatch.setattr(train, "ensure_kernels", lambda *_: None)
+    trainer = SimpleNamespace(
+        scene=SimpleNamespace(capture=SimpleNamespace(train_indices=range(9))),
+        model=SimpleNamespace(anchors=range(2 * FEWEST_ANCHORS), device=None),
+        view_step=SimpleNamespace(measure_seconds=lambda index: 0.0),
+    )
+    assert train._affordable(trainer, None, 0, Budget(seconds=60.0), Reporter()) is trainer
 
 
 @pytest.mark.parametrize(

@@ -58,8 +58,8 @@ from .points import DENSE, PLACE, starting_points
 PACE = "pace"
 """Name of the measurement of a step's time among the parts of a command."""
 
-_TIMED_VIEWS = 3
-"""Number of views on which the time of a step is measured."""
+_TIMED_VIEWS, _SHORTEST_STEP = 3, 1e-4
+"""Number of views on which the time of a step is measured, and its least seconds, as of one without anchors in view."""
 
 
 def train(options: argparse.Namespace, reporter: StoppingReporter) -> None:
@@ -251,7 +251,7 @@ def _affordable(
     for index in views[:: max(len(views) // _TIMED_VIEWS, 1)][:_TIMED_VIEWS]:
         seconds.append(trainer.view_step.measure_seconds(index))
         reporter.progress(len(seconds), _TIMED_VIEWS)
-    steps = budget.seconds / statistics.median(seconds) * processes()
+    steps = budget.seconds / max(statistics.median(seconds), _SHORTEST_STEP) * processes()
     most = affordable_anchors(anchors, steps, len(views))
     if most == anchors:
         return trainer
