@@ -153,11 +153,11 @@ class Budget:
             if not p.converged_at:
                 return (GROW_UNTIL + (PLATEAU_UNTIL if p.grown else PLATEAU_FROM)) / 2
             decay = (p.step - p.converged_at) / (end_of_decay(p) - p.converged_at)
-            if self.seconds is not None:
+            limit = self._limit(p)
+            if limit is not None:
                 # Steps take longer from here on, where images are not reduced any more.
-                begin = max(DECAY_FROM * self.seconds, _seconds_at(p, p.converged_at))
-                if begin < self.seconds:
-                    decay = max(decay, (p.seconds - begin) / (self.seconds - begin))
+                begin = max(DECAY_FROM * limit, _seconds_at(p, p.converged_at))
+                decay = max(decay, (p.seconds - begin) / (limit - begin))
             return min(PLATEAU_UNTIL + (1 - PLATEAU_UNTIL) * decay, 1.0)
         if self.steps is not None:
             done = (p.step - self.first_step) / max(self.steps - self.first_step, 1)
@@ -176,9 +176,9 @@ class Budget:
             The seconds; None as long as the end of a training until convergence cannot be estimated.
         """
         if self.until_converged:
-            end = expected_end(p)
+            end, limit = expected_end(p), self._limit(p)
             left = [] if end is None else [max(end - p.step, 0) * pace]
-            left += [] if self.seconds is None else [max(self.seconds - p.seconds, 0.0)]
+            left += [] if limit is None else [max(limit - p.seconds, 0.0)]
             return min(left, default=None)
         if self.steps is not None:
             return max(self.steps - p.step, 0) * pace
@@ -194,9 +194,9 @@ class Budget:
         progress = self.progress(p)
         if not self.until_converged or progress >= 1.0:
             return (progress - self.first) / (1.0 - self.first)
-        end = expected_end(p)
+        end, limit = expected_end(p), self._limit(p)
         steps = p.step / (p.step + LOOKAHEAD if end is None else max(end, p.step + 1))
-        return steps if self.seconds is None else min(max(steps, p.seconds / self.seconds), 1.0)
+        return steps if limit is None else min(max(steps, p.seconds / limit), 1.0)
 
     def begin(self, p: TrainingProgress) -> None:
         """Initialize `p` for this budget; the training may have been started with a different one."""
@@ -245,6 +245,14 @@ class Budget:
             return False
         p.converged_at, p.ends_at, p.limited = p.step, math.ceil(p.step / DECAY_FROM), not has_converged
         return True
+
+    def _limit(self, p: TrainingProgress) -> float | None:
+        """Return the seconds at which the learning rates end to fall at the latest; None if only steps tell.
+
+        That is without a time limit, and where the plateau took longer, as before the limit was set.
+        """
+        is_over = self.seconds is not None and p.converged_at and _seconds_at(p, p.converged_at) >= self.seconds
+        return None if is_over else self.seconds
 
     def _out_of_time(self, p: TrainingProgress) -> bool:
         """Return whether the plateau must end now so that the training ends within the time limit."""

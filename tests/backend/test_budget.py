@@ -301,6 +301,18 @@ def test_time_limit_holds_where_the_last_steps_are_slower():
     assert budget.progress(p) == 1.0
 
 
+def test_limit_below_the_time_so_far_leaves_the_decay_its_steps():
+    p = TrainingProgress(step=30_000, seconds=3600.0, curve=[{"step": 30_000, "seconds": 3600.0, "loss_db": 20.0}])
+    shorter = Budget(seconds=1800.0, until_converged=True)
+    shorter.begin(p)
+    assert shorter.evaluation_is_due(p) and shorter.check_convergence(p) and p.ends_at == 37_500
+    p.step, p.seconds = 33_750, 3900.0
+    assert shorter.progress(p) == pytest.approx((1 + PLATEAU_UNTIL) / 2)
+    assert shorter.remaining(p, 0.1) == pytest.approx(375.0) and shorter.displayed_progress(p) == pytest.approx(0.9)
+    p.step = 37_500
+    assert shorter.progress(p) == shorter.displayed_progress(p) == 1 and shorter.remaining(p, 0.1) == 0
+
+
 def test_remaining_time_is_estimated_from_curve():
     p, final = TrainingProgress(step=1000, seconds=50.0), PRESETS["final"]
     assert final.remaining(p, 0.05) is None and final.displayed_progress(p) == 1000 / (1000 + LOOKAHEAD)
