@@ -64,6 +64,11 @@ class StopRequest:
         return self._stopped
 
     @property
+    def stopped(self) -> bool:
+        """Whether a stop is requested; unlike a call, this does not wait."""
+        return self._stopped
+
+    @property
     def paused(self) -> bool:
         """Whether the next call waits."""
         return self._paused and not self._stopped

@@ -227,7 +227,7 @@ class Trainer:
             checkpoints: folder for checkpoints, which are written at the end, before a pause, and at intervals, where
                 one may fail.
             reporter: receives progress, quality and warnings.
-            evaluate: function that measures the model on held-out and validation views, and may leave out the former.
+            evaluate: measures the model on validation and, if there is time, held-out views; may raise Cancelled.
             stop: stop and pause request, checked before each step.
             checkpoint_seconds: least time between checkpoints; more if they take long to write.
 
@@ -240,6 +240,11 @@ class Trainer:
         first_step = self.progress.step
         try:
             self._train(budget, checkpoints, reporter, evaluate, stop or StopRequest(), checkpoint_seconds)
+        except Cancelled:
+            self.save(checkpoints)
+            raise Cancelled(
+                f"Stopped after {self.progress.step} steps; run the same command again to resume."
+            ) from None
         except Exception as error:
             expected = isinstance(error, (InputError, OSError, ProcessLost)) or is_lack_of_memory(error)
             if expected and self.progress.step > first_step and self.optimizer.is_complete:
@@ -257,8 +262,7 @@ class Trainer:
         stop: StopRequest,
         checkpoint_seconds: float,
     ) -> None:
-        p = self.progress
-        before, first_step = p.seconds, p.step
+        p, before, first_step = self.progress, self.progress.seconds, self.progress.step
         budget.begin(p)
         capture, validation, earlier = self.scene.capture, self.scene.capture.validation_indices, copy.copy(p)
         if self.region.is_whole and not budget.until_converged:
@@ -288,13 +292,11 @@ class Trainer:
             if stop.paused:
                 saving.save()
             wait_started = awake_seconds()
-            stopped = stop()
+            if stop():
+                raise Cancelled
             waited = awake_seconds() - wait_started
             started, last_report = started + waited, last_report + waited
             saving.delay(waited)
-            if stopped:
-                self.save(checkpoints)
-                raise Cancelled(f"Stopped after {p.step} steps; run the same command again to resume.")
             self._team.tell(Order.STEP, progress, self.optimizer.check.at_once)
             loss = self.step(progress)
             while self._warnings:
@@ -326,8 +328,7 @@ class Trainer:
             reporter.quality(**p.curve[-1], zero_is_background=self.scene.supervise_background)
 
     def _report(self, budget: Budget, reporter: Reporter, loss: float, pace: float) -> None:
-        p, left = self.progress, budget.remaining(self.progress, pace)
-        latest = p.latest
+        p, latest, left = self.progress, self.progress.latest, budget.remaining(self.progress, pace)
         reporter.progress(
             round(budget.displayed_progress(p), 5),
             1.0,

@@ -12,6 +12,7 @@ from PIL import Image
 
 from backend.commands.training import measuring
 from backend.commands.training.measuring import SHARE, Measuring
+from backend.shared.errors import Cancelled
 from backend.shared.events import Reporter
 from backend.shared.reconstruction.checkpoint import read_header
 from backend.training.budget import Budget, TrainingProgress
@@ -73,6 +74,20 @@ def test_end_and_deciding_views_are_always_measured(clock, tmp_path):
     assert set(figures) == {"validation_psnr"} and clock.drawn == [0, 7, 8]
     figures = measure(None, scene(), TrainingProgress(step=10))
     assert figures["psnr"] > 0 and clock.drawn[3:] == list(HELD_OUT)
+
+
+@pytest.mark.parametrize("last", [3, 6])
+def test_evaluation_ends_at_a_stop(clock, tmp_path, last):
+    """Among the held-out views, and among those for validation."""
+
+    def check():
+        if len(clock.drawn) == last:
+            raise Cancelled
+
+    measure = Measuring(SimpleNamespace(previews=tmp_path), Budget(steps=10), Reporter(), check)
+    with pytest.raises(Cancelled):
+        measure(None, scene(validation=(7, 8)), TrainingProgress(step=10))
+    assert clock.drawn == [*HELD_OUT, 7, 8][:last]
 
 
 def test_previews_that_cannot_be_written_are_reported_once(clock, tmp_path, monkeypatch):

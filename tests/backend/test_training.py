@@ -617,6 +617,21 @@ def test_steps_before_a_lack_of_memory_are_saved(tiny, tmp_path, monkeypatch, wh
     assert warning is None and resumed.progress.step == (0 if where == "growth" else 3)
 
 
+def test_stop_during_an_evaluation_saves_the_step(tiny, tmp_path):
+    trainer, evaluated = Trainer.start(*tiny(), SMALL), []
+
+    def evaluate(model, scene, progress):
+        evaluated.append(progress.step)
+        if progress.step >= 3:
+            raise Cancelled
+        return {}
+
+    with pytest.raises(Cancelled, match="run the same command again to resume") as stopped:
+        trainer.run(Budget(steps=20), tmp_path, Reporter(), evaluate)
+    assert Trainer.resume(trainer.scene.capture, tmp_path)[0].progress.step == evaluated[-1] >= 3
+    assert str(stopped.value).startswith(f"Stopped after {evaluated[-1]} steps")
+
+
 def test_training_is_bitwise_reproducible_and_resumable(tiny, tmp_path):
     capture, ids = tiny()
     whole = Trainer.start(capture, ids, SMALL)

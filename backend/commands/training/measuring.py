@@ -14,6 +14,7 @@ from ...model.draw import draw
 from ...model.object_model import ObjectModel
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
+from ...shared.stopping import Check, proceed
 from ...training.budget import Budget, TrainingProgress
 from ...training.scene import Scene
 
@@ -29,13 +30,14 @@ class Measuring:
 
     Held-out views are for the user; they do not decide anything. Where they would take more than `SHARE` of the time,
     as with many large photos on a CPU, they are left for later, and only the preview is written. Views that decide on
-    the training (validation and spared views) are measured each time.
+    the training (validation and spared views) are measured each time. `check` is called before each view.
     """
 
-    def __init__(self, folder: Reconstruction, budget: Budget, reporter: Reporter) -> None:
+    def __init__(self, folder: Reconstruction, budget: Budget, reporter: Reporter, check: Check = proceed) -> None:
         self._folder = folder
         self._budget = budget
         self._reporter = reporter
+        self._check = check
         self._spent = 0.0
         self._warned = False
 
@@ -54,6 +56,7 @@ class Measuring:
                 # Their exposure is not known, since they are not trained on.
                 found = []
                 for index in indices:
+                    self._check()
                     photo, drawn = capture.image(index), draw(model, scene.camera(index), want_ids=False).image
                     found.append(psnr(color_corrected(drawn, photo), photo))
                 figures[name] = float(np.mean(found))
@@ -84,6 +87,7 @@ class Measuring:
         indices = [held_out[place] for place in places]
         found, ids = [], IdScores(scene.zero_is_object)
         for number, index in enumerate(indices or (0,)):
+            self._check()
             photo, truth = capture.image(index), capture.mask(index)
             rendered = draw(model, scene.camera(index), want_ids=truth is not None or number == 0)
             if indices:

@@ -340,7 +340,13 @@ def _run(
     where = "" if trainer.model.device.type == "cpu" else f", on {devices.name_of(trainer.model.device)}"
     where += f", in {team.size} processes" if team.size > 1 else ""
     reporter.begin("train", f"{begun} {len(trainer.model.anchors):,} anchors{where}")
-    measure = Measuring(folder, budget, reporter)
+
+    def check() -> None:
+        # A pause begins after the evaluation, when the training has been saved.
+        if reporter.stop.stopped:
+            raise Cancelled
+
+    measure = Measuring(folder, budget, reporter, check)
 
     def evaluate(*state: Any) -> dict[str, Any]:
         # The other processes wait.
