@@ -23,7 +23,8 @@ def run_blocking(job: Job, reporter: Reporter) -> int:
 
     Args:
         job: a waiting job.
-        reporter: receives messages, warnings and progress. The caller must report an error, stored in `job.error`.
+        reporter: receives messages, warnings and progress, and is closed. The caller must report an error, stored in
+            `job.error`.
 
     Returns:
         The exit code: 0, 1, 2 or 130.
@@ -34,6 +35,7 @@ def run_blocking(job: Job, reporter: Reporter) -> int:
             _watch(job, reporter, signals)
     finally:
         job.kill()
+        reporter.close()
     if job.state is State.DONE:
         return EXIT_DONE
     if job.state is State.STOPPED:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Background jobs, with small programs in place of the backend that report, wait, crash, hang and print garbage."""
 
+import io
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from objectgs.backend.shared.console import ConsoleReporter
 from objectgs.backend.shared.events import Reporter
 from objectgs.objectgs_addon.blender import messages
 from objectgs.objectgs_addon.panels.jobs import JobsPanel
@@ -584,6 +586,18 @@ say("done", message="Voted.")
     assert run_blocking(refused, Reporter()) == 2 and refused.error == "No masks."
     assert run_blocking(make("os._exit(9)"), Reporter()) == 1
     assert run_blocking(make("", command=["/no/such/python"]), Reporter()) == 2
+
+
+def test_run_blocking_ends_the_bar_of_a_failed_job(make):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    stream, before = Terminal(), threading.active_count()
+    job = make('say("progress", done=0.4, total=1.0); time.sleep(0.1); sys.exit(1)')
+    assert run_blocking(job, ConsoleReporter(stream)) == 1
+    assert "40% |" in stream.getvalue() and stream.getvalue().endswith("\n")
+    until(lambda: threading.active_count() <= before)
 
 
 @posix
