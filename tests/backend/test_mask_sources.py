@@ -490,6 +490,37 @@ def test_soft_edges_of_black_and_white_masks_are_no_ids(white, photos, tmp_path)
         open_source(tmp_path, photos, [photo(0), photo(1)]).read(photo(0))
 
 
+def test_thin_objects_beside_255_are_no_soft_edges(photos, tmp_path):
+    wires = np.zeros(SIZE[::-1], np.uint8)
+    wires[20:22], wires[26:28], wires[5:15, 5:30] = 1, 2, 255
+    parts = np.zeros_like(wires)
+    parts[:8], parts[10:28] = 255, np.arange(1, 61).reshape(6, 10).repeat(3, 0).repeat(4, 1)
+    parts[10::3] = parts[:, ::4] = 0
+    outlined = np.zeros_like(wires)
+    outlined[5:15, 5:30], outlined[6:14, 6:29] = 100, 255
+    for n, ids in enumerate((wires, parts, outlined)):
+        given = tmp_path / str(n)
+        given.mkdir()
+        for name in (photo(0), photo(1)):
+            Image.fromarray(ids).save(given / f"{name}.png")
+        assert set(open_source(given, photos, [photo(0), photo(1)]).read(photo(0)).objects) == {*ids.flat} - {0}
+
+
+@pytest.mark.parametrize("are_together", [True, False])
+@pytest.mark.parametrize("colors", [((255, 0, 0), (255, 255, 0)), (255, 65535)])
+def test_two_values_of_white_are_ids(colors, are_together, photos, tmp_path):
+    for n in range(2):
+        shape, kind = ((*SIZE[::-1], 3), np.uint8) if isinstance(colors[0], tuple) else (SIZE[::-1], np.uint16)
+        ids = np.zeros(shape, kind)
+        for m, color in enumerate(colors):
+            if are_together or m == n:
+                ids[5:15, 20 * m : 20 * m + 10] = color
+        Image.fromarray(ids).save(tmp_path / f"photo {n}.png")
+    source = open_source(tmp_path, photos, [photo(0), photo(1)])
+    expected = [[255, 65535]] * 2 if are_together else [[255], [65535]]
+    assert [source.read(photo(n)).objects for n in range(2)] == expected
+
+
 def test_masks_of_a_missing_photo_are_left_out(write_capture, tmp_path, run_command):
     scene = write_capture(views=6)
     given = (scene.folder / "masks").rename(tmp_path / "given")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from itertools import takewhile
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy import ndimage
 
 from ...shared.errors import InputError
 from ..files import (
@@ -26,9 +26,6 @@ from .segments import Segments, Shape, draw_shapes
 
 _GRAY, _SOFT = 0.02, 0.1
 """Largest fraction of pixels that are neither black nor white in a JPEG that is black and white, and at soft edges."""
-
-_WHITE = (255, 65535)
-"""White in 8 and 16 bits."""
 
 _MOST_COLORS = 256
 """Largest number of colors of a file that is taken for a mask rather than for a picture, where both are there."""
@@ -66,7 +63,7 @@ class MaskFiles:
         self._labels = {**({} if has_own else read_names(folder.parent)), **read_names(folder)} if self.files else {}
         color = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
         self._is_color = bool(color) and all(map(is_three_channel, color)) and any(map(is_color_mask, color))
-        self._is_black_and_white: bool | None = None
+        self._white: int | None = None
 
     def read(self, photo: str) -> Segments:
         """Return the segments of a photo; raises InputError."""
@@ -75,22 +72,20 @@ class MaskFiles:
             ids = read_black_and_white(path).astype(np.int64)
         else:
             ids = read_mask(path, self._is_color).astype(np.int64)
-            if self._all_are_white():
-                ids = _is_white(ids if ids.max() <= 255 else ids * 255 // 65535, path, _SOFT).astype(np.int64)
+            if white := self._common_white():
+                ids = _is_white(ids * 255 // white, path, _SOFT).astype(np.int64)
         found, numbers = np.unique(ids, return_inverse=True)
         offset = 0 if len(found) and found[0] == 0 else 1
         values = found[1 - offset :].tolist()
         named = [self._labels.get(value, "") for value in values]
         return Segments((numbers.reshape(ids.shape) + offset).astype(np.int32), values, named)
 
-    def _all_are_white(self) -> bool:
-        """Return whether all files are in black and white; otherwise, 255 is the ID of an object as any other."""
-        if self._is_black_and_white is None:
+    def _common_white(self) -> int:
+        """Return the value of white if all files are in black and white; otherwise 0, and 255 is an ID as any other."""
+        if self._white is None:
             paths = [path for path in self.files.values() if path.suffix.lower() not in LOSSY_SUFFIXES]
-            masks = (read_mask(path, self._is_color) for path in paths)
-            has_white = [bool(np.isin(ids, _WHITE).any()) for ids in takewhile(_has_no_area_of_gray, masks)]
-            self._is_black_and_white = len(has_white) == len(paths) and any(has_white)
-        return self._is_black_and_white
+            self._white = 0 if self._is_color else _white_of(read_mask(path, False) for path in paths)
+        return self._white
 
 
 def _found(files: Files, names: Collection[str], beside: bool) -> dict[str, Path]:
@@ -112,11 +107,28 @@ def _is_picture(path: Path) -> bool:
     return is_three_channel(path) and read_image(path).getcolors(_MOST_COLORS) is None
 
 
-def _has_no_area_of_gray(ids: np.ndarray) -> bool:
-    """Return whether a mask has no areas of other values than black and white, such as IDs, but at most soft edges."""
-    gray = ~np.isin(ids, (0, *_WHITE))
-    is_flat = (ids[1:] == ids[:-1])[:, 1:] & (ids[:, 1:] == ids[:, :-1])[1:]
-    return bool(2 * (gray[1:, 1:] & is_flat).sum() <= gray.sum())
+def _white_of(masks: Iterable[np.ndarray]) -> int:
+    """Return the value of white in masks that are in black and white, also with soft edges, or 0 if they have IDs.
+
+    Grays are soft edges if they are no areas and most are between black and white, in shades from dark to light.
+    """
+    whites, count, soft = set(), 0, 0
+    for ids in masks:
+        white = 255 if ids.max(initial=0) <= 255 else 65535
+        is_white, gray = ids == white, (ids != 0) & (ids != white)
+        is_flat = (ids[1:] == ids[:-1])[:, 1:] & (ids[:, 1:] == ids[:, :-1])[1:]
+        if 2 * (gray[1:, 1:] & is_flat).sum() > gray.sum():
+            return 0
+        if white > 255 or is_white.any():
+            whites.add(white)
+        rows, columns = np.nonzero(gray)
+        part = ndimage.label(gray, np.ones((3, 3)))[0][rows, columns]
+        padded, values = np.pad(ids, 1, "edge"), ids[rows, columns].astype(np.int64)
+        around = np.stack([padded[rows + y, columns + x] for y in range(3) for x in range(3)])
+        signs = (around == 0).any(0), (around == white).any(0), 2 * values < white, 2 * values > white
+        is_soft = np.all([np.bincount(part, sign) > 0 for sign in signs], 0)
+        count, soft = count + len(part), soft + int(is_soft[part].sum())
+    return whites.pop() if len(whites) == 1 and 2 * soft >= count else 0
 
 
 class MaskFolders:
