@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from .files import encode_mask
 RECORD, REPAIRED = "masks.json", "repair.json"
 """Files in masks/ with how they were made of other masks, and with what was changed in them."""
 
+SAME_IDS = "same_ids"
+"""Key in repair.json: whether IDs mean the objects that they meant in the given masks."""
+
 SEGMENTS = "masks-segments"
 """Folder of a capture with the segments that models have found, so that a stopped command goes on."""
 
@@ -29,21 +33,27 @@ def is_made(folder: Path) -> bool:
 
 def is_made_of_others(folder: Path) -> bool:
     """Return whether masks/ was made of other masks; a masks.json may also be of the program that made them."""
-    return _has(folder / RECORD, "source", "objects")
+    return _content(folder / RECORD).keys() >= {"source", "objects"}
 
 
 def is_repaired(folder: Path) -> bool:
     """Return whether masks in masks/ were corrected."""
-    return _has(folder / REPAIRED, "changed")
+    return "changed" in _content(folder / REPAIRED)
 
 
-def _has(path: Path, *keys: str) -> bool:
-    """Return whether a JSON file has these keys."""
+def has_ids_of(folder: Path, given: Path) -> bool:
+    """Return whether IDs in masks/ mean what they mean in the given masks, of which it has copies or corrections."""
+    made, source = ([_content(each / name) for name in (RECORD, STROKES, REPAIRED)] for each in (folder, given))
+    return not is_made(folder) or made == source or (made[:2] == source[:2] and made[2].get(SAME_IDS) is True)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Return the content of a JSON file, which is empty if it cannot be read or is none of this program."""
     try:
         content = read_json(path)
     except InputError:
-        return False
-    return isinstance(content, dict) and content.keys() >= set(keys)
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def kept_masks(capture: Path) -> Path:

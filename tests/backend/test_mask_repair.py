@@ -14,6 +14,8 @@ from backend.labels import vote
 from backend.model.draw import draw
 from backend.pointing.mask_repair import contradicted, repair_masks
 from backend.shared.errors import EXIT_DONE
+from backend.shared.events import Reporter
+from backend.shared.stopping import StoppingReporter, StopRequest
 from backend.training.scene import Scene
 from backend.training.state import load_model
 
@@ -105,6 +107,14 @@ def test_wrong_masks_and_labels_are_corrected(trained, tmp_path, run_command, mo
     # Once more, the masks as they were given are still kept.
     assert run_command("clean-labels", out).code == EXIT_DONE
     assert sorted(path.name for path in (scene.folder / "masks-given").iterdir()) == kept
+
+
+def test_record_tells_whether_ids_are_those_of_the_given_masks(write_capture, tmp_path) -> None:
+    scene, reporter = write_capture(views=6), StoppingReporter(Reporter(), StopRequest())
+    for keeps_ids, expected in ((True, True), (True, True), (False, False), (True, False)):
+        capture = load_capture(scene.folder, tmp_path / "cache")
+        clean_labels._write(capture, {}, {"changed": {}, "moved": []}, keeps_ids, reporter)
+        assert json.loads((scene.folder / "masks" / "repair.json").read_text())["same_ids"] is expected
 
 
 def test_masks_made_after_the_training_give_splats_their_objects(write_capture, tmp_path, run_command) -> None:

@@ -494,6 +494,44 @@ def test_given_masks_do_not_come_beside_those_that_were_made_of_them(tmp_path):
     assert shown == [255, 127.5, 127.5]
 
 
+@pytest.mark.parametrize(
+    ("record", "content", "beside", "used"),
+    [
+        ("repair.json", {"changed": {}, "same_ids": True}, False, True),
+        ("repair.json", {"changed": {}, "same_ids": False}, False, False),
+        ("masks.json", {"source": "", "objects": []}, False, False),
+        ("masks.json", {"source": "", "objects": []}, True, True),
+    ],
+)
+def test_given_masks_of_later_photos_are_used_where_their_ids_are_the_same(record, content, beside, used, tmp_path):
+    folder, capture, said = tmp_path / "trip", tmp_path / "capture", []
+    for part in ("images", "masks"):
+        (folder / part).mkdir(parents=True)
+    listener = reporter()
+    listener.status = lambda message, **_: said.append(message)
+
+    def add(*names):
+        for name in names:
+            heic(folder / "images" / f"{name}.jpg")
+            Image.new("L", (160, 120), 3).save(folder / "masks" / f"{name}.png")
+        photos.take_photos([folder], capture, None, listener)
+
+    if beside:
+        (folder / "masks" / record).write_text(json.dumps(content))
+    add("a", "b")
+    if not beside:
+        with new_masks(capture, kept_masks(capture)) as made:
+            for name in ("a.jpg", "b.jpg"):
+                write_mask(made, name, np.full((120, 160), 7))
+            (made / record).write_text(json.dumps(content))
+    add("c")
+    made = sorted(path.name for path in (capture / "masks").iterdir())
+    own = ["a.png", "b.png"] if beside else ["a.jpg.png", "b.jpg.png"]
+    assert made == sorted([*own, record, *(["c.png"] if used else [])])
+    assert used != any("such as c.jpg" in message for message in said)
+    assert used != (capture / "masks-given" / "c.png").exists()
+
+
 def test_features_on_objects_are_those_of_the_present_masks(tmp_path):
     """Also if masks were changed in the capture itself; other IDs of the same objects do not matter."""
     for part in ("images", "masks", "sfm"):

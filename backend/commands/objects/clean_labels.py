@@ -14,6 +14,8 @@ from ...capture.files import Files, is_three_channel, mask_names
 from ...capture.made_masks import (
     RECORD,
     REPAIRED,
+    SAME_IDS,
+    has_ids_of,
     is_made,
     is_repaired,
     kept_masks,
@@ -189,7 +191,7 @@ def _write(
         for name in (STROKES, *([RECORD] if keeps_ids else [])):
             if (before / name).is_file():
                 shutil.copyfile(before / name, folder / name)
-        write_json(folder / REPAIRED, record)
+        write_json(folder / REPAIRED, {**record, SAME_IDS: keeps_ids and has_ids_of(before, kept)})
 
 
 def _tell(changed: dict[str, float], moved: list[dict[str, float | str]], reporter: StoppingReporter) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from ...capture.files import LOSSY_SUFFIXES, Files, encode_mask, image_size, mask_names, read_mask, same_shape
-from ...capture.made_masks import is_made, kept_masks
+from ...capture.made_masks import has_ids_of, is_made, kept_masks
 from ...capture.mask_sources import MaskFiles, ids_of
 from ...capture.names import HELD_OUT, read_held_out, read_names
 from ...shared.errors import InputError
@@ -24,10 +24,12 @@ from .stamps import IMAGES, MASKS, Stamps
 
 
 def write_masks(
-    masks: MaskFiles, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: Stamps
+    masks: MaskFiles, given: Path, photos: Sequence[str], names: Mapping[str, str], capture: Path, stamps: Stamps
 ) -> None:
-    """Write the given masks of photos to a capture; names: of the photos there."""
-    place = _place_of_given(capture)
+    """Write the masks of photos that are in the folder `given` to a capture; names: of the photos there."""
+    place = _place_of_given(capture, given)
+    corrected = _corrected(names, place)
+    photos = [photo for photo in photos if photo not in corrected]
     stamps.expect(place / (names[photo] + suffix) for photo in photos for suffix in (".png", ".npz"))
     for photo in photos:
         suffix, data = encode_mask(ids_of(masks.read(photo)))
@@ -54,7 +56,9 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
         if masks.files[photo].relative_to(folder).as_posix() not in mask_names(names[photo])[0]
         and names[photo] != photo
     }
-    place, found = _place_of_given(capture), folder.rglob("*") if folder.is_dir() else ()
+    place = _place_of_given(capture, folder)
+    corrected = {masks.files.get(photo) for photo in _corrected(names, place)}
+    found = [path for path in folder.rglob("*") if path not in corrected]
     targets = {
         **{path: capture / path.name for path in source.iterdir() if LISTS.fullmatch(path.name)},
         **{path: place / renamed.get(path, path.relative_to(folder)) for path in found},
@@ -73,7 +77,7 @@ def copy_rest(source: Path, masks: MaskFiles, names: Mapping[str, str], capture:
 
 
 def warn_of_gone(photos: Iterable[str], capture: Path, stamps: Stamps, reporter: Reporter) -> None:
-    """Say which masks of the capture do not exist beside the photos any more, unless others were made of them.
+    """Say which masks do not exist beside the photos any more or, where others were made of them, are not used.
 
     They are not deleted, since the user may have changed them there. Where a photo has another mask now, which they
     would hide, `.old` is added to their names.
@@ -85,6 +89,14 @@ def warn_of_gone(photos: Iterable[str], capture: Path, stamps: Stamps, reporter:
         reporter: receives the warning.
     """
     if is_made(capture / MASKS):
+        kept, there = Files(kept_masks(capture)), Files(capture / MASKS)
+        unused = [name for name in photos if _first(kept, name) and not _first(there, name)]
+        if unused:
+            count = "a photo" if len(unused) == 1 else f"{len(unused)} photos"
+            reporter.status(
+                f"The masks of {count}, such as {unused[0]}, are in {kept_masks(capture)} alone; import them from "
+                "there to use them."
+            )
         return
     gone = [name for name in stamps.masks_not_asked_for() if (capture / name).exists()]
     replaced = set()
@@ -103,9 +115,20 @@ def warn_of_gone(photos: Iterable[str], capture: Path, stamps: Stamps, reporter:
         )
 
 
-def _place_of_given(capture: Path) -> Path:
-    """Return the folder of the masks that are given: masks/, unless others were made of them, whose IDs differ."""
-    return kept_masks(capture) if is_made(capture / MASKS) else capture / MASKS
+def _place_of_given(capture: Path, given: Path) -> Path:
+    """Return where masks of the folder `given` belong: in masks/, unless others were made of them, whose IDs differ."""
+    return capture / MASKS if has_ids_of(capture / MASKS, given) else kept_masks(capture)
+
+
+def _corrected(names: Mapping[str, str], place: Path) -> set[str]:
+    """Return the photos that have a mask in a folder where masks were made; names: of the photos in the capture."""
+    files = Files(place)
+    return {photo for photo, name in names.items() if _first(files, name)} if is_made(place) else set()
+
+
+def _first(masks: Files, name: str) -> Path | None:
+    """Return the mask of a photo, or None."""
+    return masks.first(mask_names(name)[0])
 
 
 def _is_missing(target: Path, path: Path, capture: Path, stamps: Stamps) -> bool:
@@ -133,7 +156,7 @@ def write_object_masks(capture: Path, names: Sequence[str], folder: Path, report
     """
     found: dict[str, Path] = {}
     for masks in (Files(kept_masks(capture)), Files(capture / MASKS)):
-        found |= {name: path for name in names if (path := masks.first(mask_names(name)[0])) is not None}
+        found |= {name: path for name in names if (path := _first(masks, name))}
     if not found:
         raise InputError(f"{capture / MASKS} has no mask of any photo; add masks, or use features everywhere.")
     _require_readable(capture, names)

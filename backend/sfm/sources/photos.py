@@ -190,10 +190,10 @@ def take_photos(
             masks = MaskFiles(source / MASKS, names, base)
             if not in_place:
                 copy_rest(source, masks, names, capture, stamps)
-            write_masks(masks, masks.lossy, names, capture, stamps)
+            write_masks(masks, source / MASKS, masks.lossy, names, capture, stamps)
         if are_beside:
             masks = MaskFiles(base, names, base)
-            write_masks(masks, masks.photos, names, capture, stamps)
+            write_masks(masks, base, masks.photos, names, capture, stamps)
     except InputError:
         # Of the masks before the one that cannot be read.
         stamps.write()
