@@ -180,7 +180,7 @@ class _Summary:
     """Summary in batch.json and batch.md in `folder`, with one entry per capture.
 
     The files are read again before each change, since another computer may run other captures. Entries of captures that
-    are not among `captures` are kept if `folder` has results of them.
+    are not among `captures` are kept if `folder` has results of them, or if they tell why there are none.
     """
 
     def __init__(self, folder: Path, captures: list[Path]) -> None:
@@ -214,8 +214,8 @@ class _Summary:
                 raise InputError(f"{self.json} was not written by this program; choose another --out.") from error
         fresh = {**_NOTHING, "seconds": 0.0, "settings": None}
         self.entries = [{"name": name, **fresh, **known.get(name, {})} for name in self.names]
-        others = [name for name in known if name not in self.names and is_folder(self.json.parent / name)]
-        self.others = [{**fresh, **known[name]} for name in others]
+        others = [{**fresh, **entry} for name, entry in known.items() if name not in self.names]
+        self.others = [each for each in others if each["error"] or is_folder(self.json.parent / each["name"])]
 
     def _alone(self) -> AbstractContextManager[None]:
         return locked(self.json.parent, _LOCK, _PATIENCE)

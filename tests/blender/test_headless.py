@@ -663,14 +663,17 @@ def test_batches_of_two_computers_leave_captures_to_each_other(capture, tmp_path
 def test_batch_keeps_results_of_captures_that_another_one_runs(tmp_path):
     """Of a capture that was added since this batch began, or of another folder of captures."""
     own = _Summary(tmp_path, [Path("one"), Path("two")])
-    other = _Summary(tmp_path, [Path("one"), Path("three"), Path("gone")])
+    other = _Summary(tmp_path, [Path("one"), Path("three"), Path("gone"), Path("broken")])
+    broken = other.entry("broken") | {"state": "bad input", "error": "There are no cameras."}
+    other.update(broken)
     (tmp_path / "three").mkdir()
     three = other.entry("three") | {"state": "done", "psnr": 30.0}
     other.update(three)
     own.update(own.entry("one") | {"state": "done"})
-    assert other.entry("three") == three and list(summary(tmp_path)) == ["one", "two", "three"]
+    assert other.entry("three") == three and other.entry("broken") == broken
+    assert list(summary(tmp_path)) == ["one", "two", "three", "broken"]
     table = (tmp_path / "batch.md").read_text()
-    assert table.startswith("3 captures: 2 done, 1 unfinished.") and "| three | done |" in table
+    assert table.startswith("4 captures: 2 done, 1 bad input, 1 unfinished.") and "| three | done |" in table
     assert own.count("done") == 1
 
 
