@@ -16,6 +16,7 @@ from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
 from ...backend.shared.formats.file_names import legible
 from ...backend.shared.formats.json_file import read_json, write_json
+from ...backend.shared.formats.photos_source import NOT_OF_USERS
 from ...backend.shared.formats.regular_file import is_folder
 from ...backend.shared.reconstruction.folder import IGNORED, Reconstruction
 from ...backend.shared.reconstruction.lock import FolderInUse, locked
@@ -114,13 +115,17 @@ def _text(path: Path) -> str:
 def fingerprint(capture: Path) -> list[int]:
     """Return the number, total size in bytes and latest modification time (ns) of a capture's files.
 
-    Files that file browsers make are left out.
+    Files that file browsers and network drives make are left out.
     """
     paths = [path for part in ("images", "masks", "sparse") for path in (capture / part).rglob("*")]
     paths += [path for path in capture.iterdir() if path.suffix.lower() in _CAPTURE_FILES]
-    paths = [path for path in paths if path.name not in IGNORED and not path.name.startswith(".")]
+    paths = [path for path in paths if path.name not in IGNORED and not _is_of_no_user(path.relative_to(capture))]
     states = [path.stat() for path in paths if path.is_file()]
     return [len(states), sum(state.st_size for state in states), max((s.st_mtime_ns for s in states), default=0)]
+
+
+def _is_of_no_user(path: Path) -> bool:
+    return any(part.startswith(NOT_OF_USERS) for part in path.parts)
 
 
 def _is_done(entry: dict[str, Any], wanted: dict[str, Any], folder: Path) -> bool:

@@ -572,7 +572,8 @@ def test_batch_fingerprint_changes_with_capture(capture, tmp_path):
     shutil.copytree(capture, tmp_path / "a")
     before = fingerprint(tmp_path / "a")
     assert fingerprint(tmp_path / "a") == before
-    for name in (".DS_Store", "Thumbs.db", "._photo.jpg"):
+    for name in (".DS_Store", "Thumbs.db", "._photo.jpg", ".thumbs/a.jpg", "@eaDir/a.jpg/SYNOPHOTO_THUMB_M.jpg"):
+        (tmp_path / "a" / "images" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "a" / "images" / name).write_bytes(b"made by a file browser")
     assert fingerprint(tmp_path / "a") == before
     mask = min((tmp_path / "a" / "masks").iterdir())
