@@ -347,6 +347,33 @@ def test_annotations_of_two_photos_that_fit_one_are_refused(write, photos, tmp_p
         open_source(path, photos, [photo(0), photo(1)])
 
 
+@pytest.mark.parametrize("spelling", ["./train\\{}", "TRAIN/{}", "{}", "a/train/{}"])
+def test_annotations_of_two_spellings_of_a_photo_are_merged(spelling, photos, tmp_path):
+    path = write_coco_polygons(tmp_path)
+    content = json.loads(path.read_text())
+    for image, name in zip(content["images"], ("train/{}", spelling), strict=True):
+        image["file_name"] = name.format(photo(0))
+    content["annotations"] = [content["annotations"][0], {**content["annotations"][-1], "image_id": 1}]
+    content["annotations"][0]["image_id"] = 0
+    path.write_text(json.dumps(content))
+    assert len(open_source(path, photos, [photo(0), photo(1)]).read(photo(0)).objects) == 2
+    content["images"].append({**content["images"][0], "id": 2, "file_name": f"test/{photo(0)}"})
+    content["annotations"].append({**content["annotations"][0], "image_id": 2})
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="which fit the same photo"):
+        open_source(path, photos, [photo(0), photo(1)])
+
+
+def test_last_upload_of_a_photo_is_taken(photos, tmp_path):
+    path = write_label_studio(tmp_path)
+    tasks = json.loads(path.read_text())
+    for task, image in zip(tasks, ("/data/upload/1/0123abcd-", "/data/upload/2/ef012345-"), strict=True):
+        task["data"]["image"] = image + photo(0)
+    path.write_text(json.dumps(tasks))
+    found = open_source(path, photos, [photo(0)]).read(photo(0)).numbers
+    assert ((found > 0) == (masks_of(1) > 0)).mean() > 0.95
+
+
 def test_photo_without_segments_does_not_refuse_the_others(photos, tmp_path):
     given = tmp_path / "given"
     given.mkdir()

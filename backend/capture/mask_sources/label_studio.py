@@ -16,6 +16,7 @@ from ..models.photos import Photos, require_single
 from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turned
 
 _UPLOAD = re.compile(r"^[0-9a-f]{8}-")
+_UPLOADED = re.compile(r"^(.*/upload/\d+/)?[0-9a-f]{8}-")
 _LABELS = ("brushlabels", "polygonlabels", "rectanglelabels", "ellipselabels", "labels")
 
 
@@ -55,7 +56,8 @@ class LabelStudioMasks:
                 regions = [each for annotation in task["annotations"] for each in _regions(annotation["result"])]
                 # Photos that nobody has annotated yet are listed, too.
                 if name is not None and regions:
-                    require_single(named, name, reference, file)
+                    # The folder of an upload is none of the photo.
+                    require_single(named, name, _UPLOADED.sub("", reference), file)
                     self._results[name] = regions
         except (AttributeError, KeyError, TypeError) as error:
             raise self._invalid(error) from error

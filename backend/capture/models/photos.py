@@ -43,16 +43,20 @@ def none_found(folder: Path, names: Sequence[str], file: Path) -> InputError:
 
 
 def require_single(named: dict[str, str], photo: str, reference: str, file: Path) -> None:
-    """Note what a file calls a photo; raise InputError if it called it otherwise before, as of two cameras of a rig.
+    """Note what a file calls a photo; raise InputError if it was in another folder before, as in a rig.
 
     Args:
-        named: What the file has called each photo so far, by their names.
+        named: What the file has called each photo so far, with most folders, by their names.
         photo: The name of the photo.
         reference: What the file calls it.
         file: The file.
     """
     other = named.setdefault(photo, reference)
-    if other != reference:
+    folders = [[part.casefold() for part in _parts(each)[:-1]] for each in (other, reference)]
+    shorter, longer = sorted(folders, key=len)
+    if folders[1] == longer:
+        named[photo] = reference
+    if longer[len(longer) - len(shorter) :] != shorter:
         raise InputError(
             f"{file} names both {other} and {reference}, which fit the same photo, {photo}; put the photos into the "
             "folders that they have there, or remove one of the two from the file."
@@ -91,7 +95,7 @@ class Photos:
 
     def fitting(self, reference: str) -> Sequence[str]:
         """Return the names of the photos that fit a reference equally, relative to the folder."""
-        parts = [part for part in re.split(r"[/\\]+", reference) if part not in ("", ".", "..")]
+        parts = _parts(reference)
         for start in range(len(parts)):
             end = "/".join(parts[start:])
             found = self._files.find(end)
@@ -108,6 +112,11 @@ class Photos:
     def size(self, name: str) -> tuple[int, int]:
         """Read the width and height of a photo; raises InputError with its path."""
         return image_size(self.folder / name)
+
+
+def _parts(path: str) -> list[str]:
+    """Return the names in a path, of folders and, at last, of the file."""
+    return [part for part in re.split(r"[/\\]+", path) if part not in ("", ".", "..")]
 
 
 def _split(path: str) -> tuple[str, str]:
