@@ -364,6 +364,15 @@ def test_annotations_of_two_spellings_of_a_photo_are_merged(spelling, photos, tm
         open_source(path, photos, [photo(0), photo(1)])
 
 
+def test_regions_of_label_studio_may_share_an_id(photos, tmp_path):
+    path = write_label_studio_of_separate_labels(tmp_path)
+    tasks = json.loads(path.read_text())
+    for result in (each for task in tasks for each in task["annotations"][0]["result"]):
+        result["id"] = "1"
+    path.write_text(json.dumps(tasks))
+    assert set(open_source(path, photos, [photo(0), photo(1)]).read(photo(0)).objects) == set(NAMES.values())
+
+
 def test_last_upload_of_a_photo_is_taken(photos, tmp_path):
     path = write_label_studio(tmp_path)
     tasks = json.loads(path.read_text())

@@ -17,6 +17,7 @@ from .segments import Segments, Shape, checked_size, draw_shapes, polygon, turne
 
 _UPLOAD = re.compile(r"^[0-9a-f]{8}-")
 _UPLOADED = re.compile(r"^(.*/upload/\d+/)?[0-9a-f]{8}-")
+_SHAPE = ("x", "y", "width", "height", "radiusX", "radiusY", "points", "rle")
 _LABELS = ("brushlabels", "polygonlabels", "rectanglelabels", "ellipselabels", "labels")
 
 
@@ -106,12 +107,20 @@ def _photo_of(task: Mapping[str, Any], photos: Photos, uploaded: Mapping[str, Se
 
 def _regions(results: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
     """Return one result for each region, whose label, text and others are results, too, with the same shape and id."""
-    regions: dict[Any, dict[str, Any]] = {}
+    regions: dict[Any, list[dict[str, Any]]] = {}
     for number, each in enumerate(results):
         if "original_width" in each:
-            region = regions.setdefault(each.get("id") or (number,), {**each, "value": {}})
+            # Scripts may give several regions one id.
+            own = regions.setdefault(each.get("id") or (number,), [])
+            region = next((other for other in own if _shape(other) == _shape(each) or not _shape(each)), None)
+            if region is None:
+                own.append(region := {**each, "value": {}})
             region["value"] = {**each["value"], **region["value"]}
-    return list(regions.values())
+    return [region for own in regions.values() for region in own]
+
+
+def _shape(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    return {key: value for key, value in result["value"].items() if key in _SHAPE}
 
 
 def _as_uploaded(name: str) -> str:
