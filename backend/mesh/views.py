@@ -163,19 +163,18 @@ class Views:
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
-            return rasterize(*splats[:6], camera, want_depth=True, want_median=True, primitive=self.model.primitive)
+            return rasterize(*splats[:6], camera, want_median=True, want_surface=True, primitive=self.model.primitive)
 
     def _depth(self, drawn: Rendered) -> tuple[np.ndarray, np.ndarray]:
         """Return the depth (h, w), 0 where alpha is too small, and its uncertainty (h, w), both along z.
 
-        The uncertainty is the difference between the median and the mean depth, which agree if a pixel shows a single
-        surface. For 2D Gaussians, which are intersected with the pixel's ray, the mean approximates their common
-        surface, whereas the median jumps between Gaussians. 3D Gaussians extend through the surface, and their mean
-        depth lies behind it, so the median is used.
+        The uncertainty is the difference between the median and the mean up to it, which agree if a pixel shows a
+        single surface. For 2D Gaussians, which are intersected with the pixel's ray, this mean approximates their
+        common surface, whereas the median jumps between Gaussians, and the mean of all lies behind the surface, since
+        a little of what is behind shines through. 3D Gaussians extend through the surface, so the median is used.
         """
-        assert drawn.median is not None and drawn.depth is not None
-        alpha, median = devices.host(drawn.alpha), devices.host(drawn.median)
-        mean = devices.host(drawn.depth) / np.maximum(alpha, 1e-3)
+        assert drawn.median is not None and drawn.surface is not None
+        alpha, median, mean = (devices.host(plane) for plane in (drawn.alpha, drawn.median, drawn.surface))
         seen = (alpha >= ALPHA_SEEN) & (median > 0)
         depth = mean if self.model.primitive == "2d" else median
         return np.where(seen, depth, np.float32(0)), np.where(seen, np.abs(mean - median), np.float32(0))

@@ -25,6 +25,8 @@ class Rendered(NamedTuple):
         label_probability: (H, W), probability of each pixel's label.
         depth: (H, W), expected depth times alpha.
         median: (H, W), the depth at which the transmittance falls below one half, 0 where it does not; no gradient.
+        surface: (H, W), mean depth of the splats up to the median one, thus without what shines through the surface;
+            0 where nothing is drawn; no gradient.
         normals: (3, H, W), mean normal in camera space, towards the camera, times alpha.
         distortion: (H, W), sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2 over the blending weights w.
         frame: internal data of the renderer, for `object_map` and growth. Its `seen` (N,) marks the visible splats; its
@@ -36,6 +38,7 @@ class Rendered(NamedTuple):
     label_probability: torch.Tensor | None
     depth: torch.Tensor | None
     median: torch.Tensor | None
+    surface: torch.Tensor | None
     normals: torch.Tensor | None
     distortion: torch.Tensor | None
     frame: Any
@@ -96,18 +99,17 @@ class _Rasterize(torch.autograd.Function):
         )
         ctx.frame = frame
         holder.append(frame)
-        median = _tensor(frame.median)
-        if median is not None:
-            ctx.mark_non_differentiable(median)
+        depths = _tensor(frame.median), _tensor(frame.surface)
+        ctx.mark_non_differentiable(*(plane for plane in depths if plane is not None))
         alpha = _tensor(1.0 - frame.transmittance)
         return (
             _tensor(frame.color), alpha, _tensor(frame.label_probability), _tensor(frame.depth),
-            _tensor(frame.normals), _tensor(frame.moments), median,
+            _tensor(frame.normals), _tensor(frame.moments), *depths,
         )  # fmt: skip
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        # The last plane is the median, which has no gradient.
+        # The last planes, median and surface, have no gradient.
         renderer = ctx.renderer
         g_color, g_alpha, *others = (None if g is None else _array(renderer, g) for g in gradients[:6])
         assert g_color is not None and g_alpha is not None
@@ -129,6 +131,7 @@ def rasterize(
     labels: torch.Tensor | None = None,
     want_depth: bool = False,
     want_median: bool = False,
+    want_surface: bool = False,
     want_normals: bool = False,
     want_distortion: bool = False,
     primitive: str = "3d",
@@ -152,6 +155,7 @@ def rasterize(
         want_depth: whether to compute the depth. The depth of a disc in a pixel is that of the ray's intersection with
             its plane; the depth of a 3D Gaussian is that of its center.
         want_median: whether to compute the median depth.
+        want_surface: whether to compute the depth of the surface, without what shines through it.
         want_normals: whether to compute the normals, for discs only.
         want_distortion: whether to compute the distortion, for discs only.
         primitive: "3d" for 3D Gaussians, "2d" for discs.
@@ -167,15 +171,15 @@ def rasterize(
     if primitive == "3d" and (want_normals or want_distortion):
         raise ValueError("3D Gaussians have no normals and no distortion")
     wanted = {
-        "want_depth": want_depth, "want_median": want_median, "want_normals": want_normals,
-        "want_moments": want_distortion, "flat": primitive == "2d",
+        "want_depth": want_depth, "want_median": want_median, "want_surface": want_surface,
+        "want_normals": want_normals, "want_moments": want_distortion, "flat": primitive == "2d",
     }  # fmt: skip
     holder: list[Any] = []
-    color, alpha, label_probability, depth, normals, moments, median = _Rasterize.apply(
+    color, alpha, label_probability, depth, normals, moments, median, surface = _Rasterize.apply(
         means, quats, scales, opacities, sh, ids, camera, labels, wanted, holder
     )
     distortion = None if moments is None else alpha * moments[1] - moments[0] ** 2
-    return Rendered(color, alpha, label_probability, depth, median, normals, distortion, holder[0])
+    return Rendered(color, alpha, label_probability, depth, median, surface, normals, distortion, holder[0])
 
 
 def object_map(rendered: Rendered) -> tuple[Any, Any]:

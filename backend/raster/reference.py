@@ -26,14 +26,15 @@ from .settings import (
 class ReferenceRender(NamedTuple):
     """An image of the reference renderer.
 
-    color (3, H, W), alpha, depth, median and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in `Rendered`;
-    probabilities (H, W, n): one channel per ID.
+    color (3, H, W), alpha, depth, median, surface and distortion (H, W), normals (3, H, W; 0 for 3D Gaussians) as in
+    `Rendered`; probabilities (H, W, n): one channel per ID.
     """
 
     color: torch.Tensor
     alpha: torch.Tensor
     depth: torch.Tensor
     median: torch.Tensor
+    surface: torch.Tensor
     normals: torch.Tensor
     distortion: torch.Tensor
     probabilities: torch.Tensor
@@ -177,7 +178,7 @@ def rasterize_reference(
     rays = torch.cat([rays, torch.ones_like(rays[..., :1])], -1)
     T = torch.ones(height, width, dtype=dtype)
     color = torch.zeros(3, height, width, dtype=dtype)
-    depth, median, inverse, inverse2 = torch.zeros(4, height, width, dtype=dtype)
+    depth, median, front, covered, inverse, inverse2 = torch.zeros(6, height, width, dtype=dtype)
     normals = torch.zeros(3, height, width, dtype=dtype)
     probabilities = torch.zeros(height, width, objects, dtype=dtype)
     for n in torch.argsort(z.detach(), stable=True).tolist():
@@ -205,9 +206,12 @@ def rasterize_reference(
         channel = torch.zeros(objects, dtype=dtype)
         channel[int(ids[n])] = 1
         probabilities = probabilities + w[..., None] * channel
+        shown = torch.where(T.detach() >= 0.5, w, torch.zeros_like(w)).detach()
+        front, covered = front + shown * depths.detach(), covered + shown
         after = T * (1 - alpha)
         median = torch.where((T.detach() >= 0.5) & (after.detach() < 0.5), depths.detach(), median)
         T = after
     # sum_{i<j} w_i w_j (1 / z_i - 1 / z_j)^2
     distortion = (1 - T) * inverse2 - inverse**2
-    return ReferenceRender(color, 1 - T, depth, median, normals, distortion, probabilities)
+    surface = front / torch.where(covered > 0, covered, torch.ones_like(covered))
+    return ReferenceRender(color, 1 - T, depth, median, surface, normals, distortion, probabilities)

@@ -20,7 +20,7 @@ from backend.raster.gpu.kernels import STAGED
 from tests.backend.test_raster import NAMES, as_float32, camera, random_scene, rasterize
 from tests.backend.test_raster_stiff import assert_same_bits, draw
 
-PLANES = ("want_depth", "want_median", "want_normals", "want_distortion")
+PLANES = ("want_depth", "want_median", "want_surface", "want_normals", "want_distortion")
 
 TURN_AROUND = """#include "platform.h"
 KERNEL(64, 1) turn_around(float *values, int with_barrier) {
@@ -156,7 +156,7 @@ def test_single_plane_matches_all_planes(wanted, primitive):
     planes = []
     for everything in (False, True):
         scene = {k: v.requires_grad_(k != "ids") for k, v in as_float32(random_scene(2, count=25)).items()}
-        wanted_planes = {name: (everything and (flat or name in PLANES[:2])) or name == wanted for name in PLANES}
+        wanted_planes = {name: (everything and (flat or name in PLANES[:3])) or name == wanted for name in PLANES}
         rendered = rasterize(
             **scene, camera=cam, labels=labels if everything or wanted == "labels" else None, primitive=primitive,
             **wanted_planes,
@@ -258,7 +258,7 @@ def test_memory_of_a_frame_is_released_without_collection(primitive):
     gc.disable()
     try:
         drawn = rasterize(
-            **scene, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat,
+            **scene, camera=cam, labels=labels, want_depth=True, want_median=True, want_surface=True, want_normals=flat,
             want_distortion=flat, primitive=primitive,
         )  # fmt: skip
         (drawn.color.sum() + drawn.label_probability.sum() + drawn.depth.sum()).backward()

@@ -22,7 +22,7 @@ from .conftest import EMULATES, NO_EMULATOR
 
 ROOT = Path(__file__).parents[2]
 HERE = Path("tests") / "backend"
-SURFACE = {"DEPTHS": True, "MEDIAN": False, "NORMALS": True, "MOMENTS": True}
+SURFACE = {"DEPTHS": True, "MEDIAN": False, "SURFACE": True, "NORMALS": True, "MOMENTS": True}
 PLAIN = dict.fromkeys(SURFACE, False)
 OF_ROWS = [{"COLUMNS": 10, "ROW": 16}, {"COLUMNS": 19, "ROW": 32}]
 OF_ANCHORS = {"OFFSETS": 10, "FEATURES": 32, "LOG_EXTENT_MAX": 20.0, "RAW_OPACITY_MIN": 0.004}

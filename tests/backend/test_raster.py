@@ -84,8 +84,8 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
     fast = {k: v.clone().requires_grad_(k != "ids") for k, v in scene.items()}
     slow = {k: v.clone() if k == "ids" else v.double().requires_grad_() for k, v in scene.items()}
     got = rasterize(
-        **fast, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat, want_distortion=flat,
-        primitive=primitive,
+        **fast, camera=cam, labels=labels, want_depth=True, want_median=True, want_surface=True, want_normals=flat,
+        want_distortion=flat, primitive=primitive,
     )  # fmt: skip
     want = rasterize_reference(**slow, camera=cam, objects=objects, primitive=primitive)
     index = labels.long().clamp(min=0)[..., None]
@@ -105,8 +105,9 @@ def compare(scene, cam, objects=5, seed=0, value_tolerance=2e-5, gradient_tolera
         assert torch.isfinite(a).all()
         np.testing.assert_allclose(a.detach().numpy(), b.detach().numpy(), rtol=1e-4, atol=value_tolerance)
     # Where the transmittance is almost exactly one half, rounding decides which of two splats is the median.
-    differs = np.abs(got.median.numpy() - want.median.numpy()) > 1e-4 * want.median.numpy() + value_tolerance
-    assert differs.mean() < 2e-3 and not got.median.requires_grad
+    for plane, wanted in ((got.median, want.median.numpy()), (got.surface, want.surface.numpy())):
+        assert (np.abs(plane.numpy() - wanted) > 1e-4 * wanted + value_tolerance).mean() < 2e-3
+        assert not plane.requires_grad
     loss = sum((a * v.float()).sum() for (a, _), v in zip(pairs, g, strict=True))
     loss64 = sum((b * v).sum() for (_, b), v in zip(pairs, g, strict=True))
     if want.color.requires_grad:
@@ -166,6 +167,23 @@ def test_median_depth_is_at_half_transmittance():
         layers["opacities"] = torch.tensor(opacities)
         median = rasterize(**as_float32(layers), camera=cam, want_median=True).median
         np.testing.assert_allclose(median, depth)
+
+
+def test_surface_depth_is_the_mean_up_to_the_median():
+    cam = camera()
+    layers = random_scene(0, count=4, size=30.0)
+    layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 50.0)], dtype=torch.float64)
+    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 4)
+    layers["scales"][:] = 1e3
+    for opacities, depth in (
+        ((0.4, 0.5, 0.9, 0.9), (0.4 * 2 + 0.3 * 3) / 0.7), ((0.6, 0.9, 0.9, 0.9), 2.0),
+        ((0.1, 0.1, 0.1, 0.1), (0.1 * 2 + 0.09 * 3 + 0.081 * 4 + 0.0729 * 50) / 0.3439),
+    ):  # fmt: skip
+        layers["opacities"] = torch.tensor(opacities)
+        surface = rasterize(**as_float32(layers), camera=cam, want_surface=True).surface
+        np.testing.assert_allclose(surface, depth, rtol=1e-3)
+    nothing = {name: value[:0] for name, value in as_float32(layers).items()}
+    assert not rasterize(**nothing, camera=cam, want_surface=True).surface.any()
 
 
 @PRIMITIVES

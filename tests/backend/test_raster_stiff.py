@@ -75,7 +75,7 @@ def draw(scene, cam, labels=None, seed=0, primitive="3d"):
         **leaves, camera=cam, labels=labels, want_depth=True, want_normals=flat, want_distortion=flat,
         primitive=primitive,
     )  # fmt: skip
-    planes = [p for p in rendered[:7] if p is not None]
+    planes = [p for p in rendered[:8] if p is not None]
     rng = np.random.default_rng(seed)
     sum((p * torch.tensor(rng.normal(size=tuple(p.shape)), dtype=p.dtype)).sum() for p in planes).backward()
     arrays = {f"plane {i}": p.detach().numpy() for i, p in enumerate(planes)}
@@ -504,8 +504,8 @@ def tilted(angle, scale=(0.5, 0.3, 1.0), **kwargs):
 def render_all_planes(scene, cam):
     """Render discs with all planes."""
     return rasterize(
-        **as_float32(scene), camera=cam, want_depth=True, want_median=True, want_normals=True, want_distortion=True,
-        primitive="2d",
+        **as_float32(scene), camera=cam, want_depth=True, want_median=True, want_surface=True, want_normals=True,
+        want_distortion=True, primitive="2d",
     )  # fmt: skip
 
 

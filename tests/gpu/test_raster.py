@@ -38,13 +38,13 @@ def step(scene, cam, primitive, device):
     labels = torch.tensor(rng.integers(0, 5, (cam.height, cam.width)), dtype=torch.int32).to(device)
     leaves = {k: v.detach().to(device).requires_grad_(k != "ids") for k, v in scene.items()}
     rendered = raster.rasterize(
-        **leaves, camera=cam, labels=labels, want_depth=True, want_median=True, want_normals=flat,
+        **leaves, camera=cam, labels=labels, want_depth=True, want_median=True, want_surface=True, want_normals=flat,
         want_distortion=flat, primitive=primitive,
     )  # fmt: skip
     planes = {name: p for name, p in zip(rendered._fields[:-1], rendered[:-1], strict=True) if p is not None}
     loss = 0
     for name, plane in planes.items():
-        if name != "median":
+        if name not in ("median", "surface"):
             loss = loss + (plane * torch.tensor(rng.normal(size=plane.shape), dtype=torch.float32).to(device)).sum()
     loss.backward()
     ids, probability = (torch.as_tensor(a) for a in raster.object_map(rendered))
@@ -64,7 +64,7 @@ def test_large_scenes_match_cpu_renderer(count, size, primitive):
     for name, expected in there.items():
         got = here[name]
         assert np.isfinite(got).all(), name
-        if name in ("ids", "median"):
+        if name in ("ids", "median", "surface"):
             # Where two objects or splats are almost equal, rounding decides.
             assert (np.abs(got - expected) > 1e-4).mean() < 1e-3, name
         elif name in (*NAMES, "screen"):

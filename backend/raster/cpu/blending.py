@@ -28,6 +28,7 @@ _ALPHA_MAX = np.float32(ALPHA_MAX)
 _TRANSMITTANCE_THRESHOLD = np.float32(TRANSMITTANCE_THRESHOLD)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
+_TINY = np.float32(1e-7)
 _SPOT = np.float32(SPOT)
 
 
@@ -38,8 +39,9 @@ def _add(plane, at, value):
 
 @kernel(parallel=True)
 def blend(
-    splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_normals,
-    want_moments, color, transmittance, label_probability, depth, median, normals, moments, isect_counts,
+    splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_surface,
+    want_normals, want_moments, color, transmittance, label_probability, depth, median, surface, normals, moments,
+    isect_counts,
 ):  # fmt: skip
     """Blend all tiles. All planes are float32; requested planes are written completely.
 
@@ -49,12 +51,13 @@ def blend(
         ids: (N,) int32.
         labels: (H, W) int32.
         isect_offsets, isect_ids: see `bin_splats`.
-        want_labels, want_depth, want_median, want_normals, want_moments: the requested planes.
+        want_labels, want_depth, want_median, want_surface, want_normals, want_moments: the requested planes.
         color: (3, H, W).
         transmittance: (H, W).
         label_probability: (H, W), the sum of w_i over the splats whose ID is the pixel's label.
         depth: (H, W), the sum of w_i z_i.
         median: (H, W), the z_i at which T falls below 1/2, 0 where it does not.
+        surface: (H, W), the mean of the z_i, weighted by w_i, where T is at least 1/2 before them.
         normals: (3, H, W), the sum of w_i n_i; for discs only.
         moments: (2, H, W), the sums of w_i m_i and w_i m_i^2; for discs only. m_i is 1 / z_i minus that of the first
             splat in the pixel, to avoid cancellation where depths differ little.
@@ -65,16 +68,18 @@ def blend(
     for index in prange(count):
         _blend_tile(
             spread(np.int64(index), columns, count // columns),
-            splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_normals,
-            want_moments, color, transmittance, label_probability, depth, median, normals, moments, isect_counts,
+            splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_surface,
+            want_normals, want_moments, color, transmittance, label_probability, depth, median, surface, normals,
+            moments, isect_counts,
         )  # fmt: skip
 
 
 @kernel()
 def _blend_tile(
     tile,
-    splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_normals,
-    want_moments, color, transmittance, label_probability, depth, median, normals, moments, isect_counts,
+    splats, tilts, ids, labels, isect_offsets, isect_ids, want_labels, want_depth, want_median, want_surface,
+    want_normals, want_moments, color, transmittance, label_probability, depth, median, surface, normals, moments,
+    isect_counts,
 ):  # fmt: skip
     height, width = transmittance.shape
     columns = (width + TILE_W - 1) // TILE_W
@@ -83,7 +88,7 @@ def _blend_tile(
     tile_y = (tile // columns) * TILE_H
     rows = min(TILE_H, height - tile_y)
     cols = min(TILE_W, width - tile_x)
-    planes = np.zeros((7 if tilts is None else 13) * plane, np.float32)
+    planes = np.zeros((8 if tilts is None else 14) * plane, np.float32)
     T = planes[:plane]
     red = planes[plane : 2 * plane]
     green = planes[2 * plane : 3 * plane]
@@ -91,7 +96,8 @@ def _blend_tile(
     lab = planes[4 * plane : 5 * plane]
     dep = planes[5 * plane : 6 * plane]
     med = planes[6 * plane : 7 * plane]
-    extra = planes[7 * plane :]
+    front = planes[7 * plane : 8 * plane]
+    extra = planes[8 * plane :]
     want = np.empty(plane, np.int32)
     live = np.zeros(TILE_H, np.bool_)
     starts = np.empty(ROW_SLOTS, np.int32)
@@ -111,6 +117,7 @@ def _blend_tile(
     alpha_max = simd.splat(_ALPHA_MAX)
     one = simd.splat(_ONE)
     half = simd.splat(_HALF)
+    tiny = simd.splat(_TINY)
     spot = simd.splat(_SPOT)
     first = isect_offsets[tile]
     last = isect_offsets[tile + 1]
@@ -171,7 +178,7 @@ def _blend_tile(
                 if want_labels:
                     match = simd.equal_i(simd.load_i(want, at), mine)
                     simd.store(lab, at, simd.load(lab, at) + simd.keep(match, w))
-                if want_depth or want_median:
+                if want_depth or want_median or want_surface:
                     here = z
                     if tilts is not None:
                         here = simd.where(plane_drawn, z * per_q, z)
@@ -180,6 +187,10 @@ def _blend_tile(
                     if want_median:
                         crosses = simd.both(simd.at_least(t, half), simd.above(half, after))
                         simd.store(med, at, simd.where(crosses, here, simd.load(med, at)))
+                    if want_surface:
+                        mean = simd.load(front, at)
+                        share = simd.keep(simd.at_least(t, half), w / simd.maximum(one - after, tiny))
+                        simd.store(front, at, mean + share * (here - mean))
                 if tilts is not None:
                     if want_normals:
                         _add(extra, at, w * normal_x)
@@ -210,6 +221,9 @@ def _blend_tile(
         if want_median:
             for x in range(cols):
                 median[y, tile_x + x] = med[row * STRIDE + x]
+        if want_surface:
+            for x in range(cols):
+                surface[y, tile_x + x] = front[row * STRIDE + x]
         if tilts is not None:
             if want_normals:
                 for i in range(3):

@@ -42,7 +42,7 @@ class Frame:
 
     Attributes:
         color, transmittance: (3, H, W) and (H, W).
-        label_probability, depth, median, normals, moments: the requested planes, see `blend`.
+        label_probability, depth, median, surface, normals, moments: the requested planes, see `blend`.
         splats, tilts: the projected splats (splats.py, discs.py).
         isect_offsets, isect_ids, isect_rows, row_offsets: the tile intersections, see `bin_splats`.
         isect_counts: (T,), number of blended intersections of each tile.
@@ -57,6 +57,7 @@ class Frame:
     label_probability: np.ndarray | None
     depth: np.ndarray | None
     median: np.ndarray | None
+    surface: np.ndarray | None
     normals: np.ndarray | None
     moments: np.ndarray | None
     splats: np.ndarray
@@ -80,6 +81,7 @@ def forward(
     labels: np.ndarray | None = None,
     want_depth: bool = False,
     want_median: bool = False,
+    want_surface: bool = False,
     want_normals: bool = False,
     want_moments: bool = False,
     flat: bool = False,
@@ -91,8 +93,8 @@ def forward(
         camera: the view.
         labels: (H, W) int32; if given, label_probability is computed, the sum of the blending weights of the splats
             whose ID is the pixel's label.
-        want_depth, want_median, want_normals, want_moments: whether to compute these planes; normals and moments are
-            available only for discs.
+        want_depth, want_median, want_surface, want_normals, want_moments: whether to compute these planes; normals and
+            moments are available only for discs.
         flat: whether to render discs instead of 3D Gaussians.
 
     Returns:
@@ -113,18 +115,19 @@ def forward(
 
     color = np.empty((3, height, width), np.float32)
     transmittance = np.empty((height, width), np.float32)
-    label_probability, depth, median = planes(labels is not None), planes(want_depth), planes(want_median)
+    label_probability, depth = planes(labels is not None), planes(want_depth)
+    median, surface = planes(want_median), planes(want_surface)
     normals, moments = planes(want_normals, 3), planes(want_moments, 2)
     isect_counts = np.empty(isect_offsets.size - 1, np.int64)
     blend(
         splats, tilts, g.ids, _NO_LABELS if labels is None else labels, isect_offsets, isect_ids, labels is not None,
-        want_depth, want_median, want_normals, want_moments, color, transmittance, _or_empty(label_probability),
-        _or_empty(depth), _or_empty(median), _or_empty(normals, _NO_PLANES), _or_empty(moments, _NO_PLANES),
-        isect_counts,
+        want_depth, want_median, want_surface, want_normals, want_moments, color, transmittance,
+        _or_empty(label_probability), _or_empty(depth), _or_empty(median), _or_empty(surface),
+        _or_empty(normals, _NO_PLANES), _or_empty(moments, _NO_PLANES), isect_counts,
     )  # fmt: skip
     return Frame(
-        g, camera, labels, color, transmittance, label_probability, depth, median, normals, moments, splats, tilts,
-        isect_offsets, isect_ids, isect_rows, row_offsets, isect_counts,
+        g, camera, labels, color, transmittance, label_probability, depth, median, surface, normals, moments, splats,
+        tilts, isect_offsets, isect_ids, isect_rows, row_offsets, isect_counts,
     )  # fmt: skip
 
 

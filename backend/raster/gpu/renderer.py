@@ -45,6 +45,7 @@ class Frame:
     label_probability: torch.Tensor | None
     depth: torch.Tensor | None
     median: torch.Tensor | None
+    surface: torch.Tensor | None
     normals: torch.Tensor | None
     moments: torch.Tensor | None
     splats: torch.Tensor
@@ -66,6 +67,7 @@ def forward(
     labels: torch.Tensor | None = None,
     want_depth: bool = False,
     want_median: bool = False,
+    want_surface: bool = False,
     want_normals: bool = False,
     want_moments: bool = False,
     flat: bool = False,
@@ -91,12 +93,13 @@ def forward(
 
     color = torch.empty((3, height, width), device=device)
     transmittance = torch.empty((height, width), device=device)
-    label_probability, depth, median = planes(labels is not None), planes(want_depth), planes(want_median)
+    label_probability, depth = planes(labels is not None), planes(want_depth)
+    median, surface = planes(want_median), planes(want_surface)
     normals, moments = planes(want_normals, 3), planes(want_moments, 2)
     isect_counts = torch.empty(columns * lines, dtype=torch.int32, device=device)
     blend = raster_kernel(
-        "blend", FLAT=flat, LABELS=labels is not None, DEPTHS=want_depth, MEDIAN=want_median, NORMALS=want_normals,
-        MOMENTS=want_moments,
+        "blend", FLAT=flat, LABELS=labels is not None, DEPTHS=want_depth, MEDIAN=want_median, SURFACE=want_surface,
+        NORMALS=want_normals, MOMENTS=want_moments,
     )  # fmt: skip
     capacity = min(total.expected_capacity(), _MOST_INTERSECTIONS)
     while True:
@@ -104,7 +107,7 @@ def forward(
         blend(
             columns * lines, THREADS, splats, tilts, g.ids, labels, intersections.isect_offsets,
             intersections.isect_ids, columns, width, height, color, transmittance, label_probability, depth, median,
-            normals, moments, isect_counts,
+            surface, normals, moments, isect_counts,
         )  # fmt: skip
         needed = total.wait()
         if needed <= capacity:
@@ -113,8 +116,8 @@ def forward(
             raise torch.cuda.OutOfMemoryError(f"{needed} intersections of tiles and splats are too many to be sorted")
         capacity = needed
     return Frame(
-        g, camera, labels, color, transmittance, label_probability, depth, median, normals, moments, splats, tilts,
-        view, intersections, isect_counts,
+        g, camera, labels, color, transmittance, label_probability, depth, median, surface, normals, moments, splats,
+        tilts, view, intersections, isect_counts,
     )  # fmt: skip
 
 

@@ -1,5 +1,5 @@
-// Front-to-back blending of splats in tiles; one block per tile. LABELS, DEPTHS, MEDIAN, NORMALS, MOMENTS: whether these
-// planes are wanted; the others are not accessed.
+// Front-to-back blending of splats in tiles; one block per tile. LABELS, DEPTHS, MEDIAN, SURFACE, NORMALS, MOMENTS: whether
+// these planes are wanted; the others are not accessed.
 //
 // isect_counts receives the number of intersections of each tile up to the last one that contributed.
 #include "staging.h"
@@ -7,7 +7,8 @@
 KERNEL(THREADS, 1) blend(
     const float *splats, const float *tilts, const int *ids, const int *labels, const long long *isect_offsets,
     const int *isect_ids, int columns, int width, int height, float *color, float *transmittance,
-    float *label_probability, float *depth, float *median, float *normals, float *moments, int *isect_counts) {
+    float *label_probability, float *depth, float *median, float *surface, float *normals, float *moments,
+    int *isect_counts) {
     SHARED(float, stage, [STAGED][STRIDE]);
     SHARED(int, owners, [STAGED]);
     SHARED(int, last_needed, [1]);
@@ -22,7 +23,7 @@ KERNEL(THREADS, 1) blend(
     const int label = LABELS && inside ? labels[pixel] : -1;
     if (thread == 0) last_needed[0] = 0;
     float t = inside ? 1.0f : 0.0f;
-    float red = 0.0f, green = 0.0f, blue = 0.0f, probability = 0.0f, z_sum = 0.0f, z_median = 0.0f;
+    float red = 0.0f, green = 0.0f, blue = 0.0f, probability = 0.0f, z_sum = 0.0f, z_median = 0.0f, z_surface = 0.0f;
     float nx = 0.0f, ny = 0.0f, nz = 0.0f, m1 = 0.0f, m2 = 0.0f, origin = 0.0f;
     int needed = 0;
     const int first = (int)isect_offsets[tile], last = (int)isect_offsets[tile + 1];
@@ -52,11 +53,12 @@ KERNEL(THREADS, 1) blend(
                 green += w * row[S_GREEN];
                 blue += w * row[S_BLUE];
                 if (LABELS && owners[k] == label) probability += w;
-#if DEPTHS || MEDIAN
+#if DEPTHS || MEDIAN || SURFACE
                 float z = row[S_DEPTH];
                 if (FLAT && per_q > 0.0f) z *= per_q;
                 if (DEPTHS) z_sum += w * z;
                 if (MEDIAN && t >= 0.5f && after < 0.5f) z_median = z;
+                if (SURFACE && t >= 0.5f) z_surface += w / (1.0f - after) * (z - z_surface);
 #endif
 #if NORMALS
                 nx += w * row[S_NORMAL_X];
@@ -86,6 +88,7 @@ KERNEL(THREADS, 1) blend(
     if (LABELS) label_probability[pixel] = probability;
     if (DEPTHS) depth[pixel] = z_sum;
     if (MEDIAN) median[pixel] = z_median;
+    if (SURFACE) surface[pixel] = z_surface;
     if (NORMALS) normals[pixel] = nx, normals[plane + pixel] = ny, normals[2 * plane + pixel] = nz;
     if (MOMENTS) moments[pixel] = m1, moments[plane + pixel] = m2;
 }
