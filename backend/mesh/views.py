@@ -101,7 +101,8 @@ class Views:
         camera = self.camera(index)
         drawn = self._draw(self._scene_splats(camera), camera)
         ids, probability = (devices.host(plane) for plane in object_map(drawn))
-        found = SceneMap(camera, *self._depth(drawn), ids, probability)
+        # What lies just behind the surface does not count as hidden by it.
+        found = SceneMap(camera, *self._depth(drawn, up_to_median=False), ids, probability)
         if self._take(_bytes(found)):
             self._maps[index] = found
         return found
@@ -131,7 +132,9 @@ class Views:
         shown = self._shown(index)[y : y + height, x : x + width] * self._claimed(index)[y : y + height, x : x + width]
         visible = np.clip(shown / np.maximum(alpha, 1e-3), 0, 1).astype(np.float32)
         color = np.moveaxis(devices.host(drawn.color), 0, 2) / np.maximum(alpha, 1e-3)[..., None]
-        return ObjectView(camera, x, y, *self._depth(drawn), alpha, np.ascontiguousarray(color), visible)
+        return ObjectView(
+            camera, x, y, *self._depth(drawn, up_to_median=True), alpha, np.ascontiguousarray(color), visible
+        )
 
     def _claimed(self, index: int) -> np.ndarray:
         """Return the pixels (H, W) bool that may show the current objects, according to the photo's mask.
@@ -163,20 +166,27 @@ class Views:
 
     def _draw(self, splats: Generated, camera: Camera) -> Rendered:
         with torch.no_grad():
-            return rasterize(*splats[:6], camera, want_median=True, want_surface=True, primitive=self.model.primitive)
+            return rasterize(
+                *splats[:6], camera, want_depth=True, want_median=True, want_surface=True,
+                primitive=self.model.primitive,
+            )  # fmt: skip
 
-    def _depth(self, drawn: Rendered) -> tuple[np.ndarray, np.ndarray]:
+    def _depth(self, drawn: Rendered, up_to_median: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the depth (h, w), 0 where alpha is too small, and its uncertainty (h, w), both along z.
 
-        The uncertainty is the difference between the median and the mean up to it, which agree if a pixel shows a
-        single surface. For 2D Gaussians, which are intersected with the pixel's ray, this mean approximates their
-        common surface, whereas the median jumps between Gaussians, and the mean of all lies behind the surface, since
-        a little of what is behind shines through. 3D Gaussians extend through the surface, so the median is used.
+        The uncertainty is the difference between the median and the mean depth, which agree if a pixel shows a single
+        surface. 3D Gaussians extend through the surface, and their mean depth lies behind it, so the median is used.
+        For 2D Gaussians, which are intersected with the pixel's ray, a mean approximates their common surface, whereas
+        the median jumps between Gaussians. That of all lies a little behind the surface, since what is behind shines
+        through; that of those up to the median does not.
         """
-        assert drawn.median is not None and drawn.surface is not None
-        alpha, median, mean = (devices.host(plane) for plane in (drawn.alpha, drawn.median, drawn.surface))
+        assert drawn.median is not None and drawn.depth is not None and drawn.surface is not None
+        alpha, median = devices.host(drawn.alpha), devices.host(drawn.median)
+        mean = devices.host(drawn.depth) / np.maximum(alpha, 1e-3)
         seen = (alpha >= ALPHA_SEEN) & (median > 0)
-        depth = mean if self.model.primitive == "2d" else median
+        depth = median
+        if self.model.primitive == "2d":
+            depth = devices.host(drawn.surface) if up_to_median else mean
         return np.where(seen, depth, np.float32(0)), np.where(seen, np.abs(mean - median), np.float32(0))
 
     def _scene_splats(self, camera: Camera) -> Generated:
