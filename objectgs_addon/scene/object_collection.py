@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 
 from ...backend.shared.color.palette import to_linear
-from .edits.axes import give_axes, part_axes, put_below, set_local_map
+from .edits.axes import give_axes, length_scale, part_axes, put_below, set_local_map
 from .kinds import (
     MESH,
     MESH_MATERIAL,
@@ -64,6 +64,7 @@ def ensure_pivot(
         place = np.eye(4)
         place[:3, 3] = center
         set_local_map(pivot, place @ np.linalg.inv(part_axes(pivot)))
+        pivot.empty_display_size *= length_scale(part_axes(pivot))
         for part in parts_of(collection):
             if part.parent is None:
                 put_below(part, pivot)

@@ -1122,6 +1122,19 @@ def test_transforms_stay_in_the_axes_of_the_world_after_orientation(root, folder
     assert (folder / "objects.json").read_bytes() == stored
 
 
+def test_empties_of_objects_are_drawn_in_the_size_of_their_objects(root, parts_shown):
+    def drawn(pivot) -> float:
+        bpy.context.view_layer.update()
+        return pivot.empty_display_size * max(pivot.matrix_world.to_scale())
+
+    before = drawn(parts_shown[0])
+    blender_scene.scale_to_distance(root, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.05)
+    assert drawn(parts_shown[0]) == pytest.approx(0.05 * before, rel=1e-4)
+    bpy.data.objects.remove(parts_shown[0])
+    show_again(root)
+    assert drawn(part(root, "object_parent")) == pytest.approx(0.05 * before, rel=0.1), "made anew"
+
+
 def test_deleted_pivots_and_parents_are_made_again_in_place(root, parts_shown):
     before = seen(parts_shown)
     bpy.data.objects.remove(parts_shown[0])

@@ -54,6 +54,12 @@ def renew_axes(root: bpy.types.Collection, parent: bpy.types.Object) -> None:
             relative = np.round(before @ np.array(child.matrix_parent_inverse, np.float64), DIGITS)
             child.matrix_parent_inverse = Matrix((after @ relative).tolist())
         set_local_map(pivot, local @ np.linalg.inv(after @ before))
+        pivot.empty_display_size *= length_scale(after @ before)
+
+
+def length_scale(matrix: np.ndarray) -> float:
+    """Return the factor by which a map (4, 4) scales lengths, on average over all directions."""
+    return float(np.abs(np.linalg.det(matrix[:3, :3])) ** (1 / 3))
 
 
 def part_axes(above: bpy.types.Object | None) -> np.ndarray:
