@@ -30,13 +30,7 @@ class PointPicker:
     def __init__(
         self, root: bpy.types.Collection, view_layer: bpy.types.ViewLayer, space: bpy.types.SpaceView3D | None
     ) -> None:
-        positions = [
-            _world_positions(part)
-            for collection in (root, *root.children_recursive)
-            for part in collection.objects
-            if scene.kind_of(part) in ("points", "splats", "mesh") and drawing.shown(part, view_layer, space)
-        ]
-        self.positions = np.concatenate(positions) if positions else np.zeros((0, 3))
+        self.positions = shown_positions(root, view_layer, space)
         self.picked = []
         self._handler = None
 
@@ -130,13 +124,35 @@ def nearest(positions: Any, perspective: Any, size: Any, mouse: Any, reach: floa
     return int(front[np.argmin(distance[front])])
 
 
-def _world_positions(part: bpy.types.Object) -> Any:
-    """Return the vertices or visible splats of an object in world coordinates, (N, 3) float64."""
+def shown_positions(
+    root: bpy.types.Collection,
+    view_layer: bpy.types.ViewLayer,
+    space: bpy.types.SpaceView3D | None,
+    at_most: int | None = None,
+) -> np.ndarray:
+    """Return the vertices and splats that a view layer shows in one of its viewports, (N, 3) float64 in the world.
+
+    at_most: the largest number of them; of more, every k-th is returned.
+    """
+    parts = [
+        part
+        for collection in (root, *root.children_recursive)
+        for part in collection.objects
+        if scene.kind_of(part) in ("points", "splats", "mesh") and drawing.shown(part, view_layer, space)
+    ]
+    count = sum(len(part.data.vertices) for part in parts)
+    step = 1 if at_most is None else max(-(-count // at_most), 1)
+    return np.concatenate([np.zeros((0, 3)), *(_world_positions(part, step) for part in parts)])
+
+
+def _world_positions(part: bpy.types.Object, step: int) -> np.ndarray:
+    """Return every `step`-th vertex or visible splat of an object in world coordinates, (N, 3) float64."""
     arrays = arrays_of(part.data) if scene.kind_of(part) == "splats" else None
     if arrays is not None:
-        local = arrays.means[arrays.opacities > MIN_OPACITY]
+        local = arrays.means[::step][arrays.opacities[::step] > MIN_OPACITY]
     else:
         local = np.empty((len(part.data.vertices), 3), np.float32)
         part.data.vertices.foreach_get("co", local.reshape(-1))
+        local = local[::step]
     matrix = np.array(part.matrix_world)
     return local @ matrix[:3, :3].T + matrix[:3, 3]

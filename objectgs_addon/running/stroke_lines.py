@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,8 +13,8 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from .. import scene
-from ..picking.point_picker import PointPicker
+from .. import drawing, scene
+from ..picking.point_picker import shown_positions
 from . import pointing
 
 _WHITE = (1.0, 1.0, 1.0)
@@ -28,8 +29,13 @@ _REACH = 8.0
 _FRONT = 0.2
 """Share of these points that are in front of the line."""
 
-_placed: dict[str, np.ndarray] = {}
-"""Waiting stroke -> its line in the capture, (n, 3)."""
+_MOST_POINTS = 200_000
+"""Largest number of points of the scene in which a line's depth is looked up."""
+_AT_ONCE = 0.05
+"""Time in seconds after which the lines that are still to be placed wait for the next redraw."""
+
+_placed: dict[int, dict[str, np.ndarray]] = {}
+"""Session UID of a reconstruction -> of each waiting stroke, its line in the capture, (n, 3)."""
 _handler = None
 
 
@@ -97,30 +103,36 @@ def lines(
 ) -> list[tuple[np.ndarray, tuple[float, ...]]]:
     """Return the lines of a reconstruction's strokes that are not answered yet, which a viewport shows.
 
+    Those of many strokes on a large scene follow in the next redraws.
+
     Returns:
         Of each line, its corners (n, 3) in the world, and its color.
     """
     waiting = [(stroke, json.dumps(stroke)) for stroke in pointing.waiting_strokes(root)]
-    kept = {key: _placed[key] for _, key in waiting if key in _placed}
-    _placed.clear()
-    _placed.update(kept)
+    before = _placed.pop(root.session_uid, {})
     if not waiting:
         return []
+    placed = _placed[root.session_uid] = {key: before[key] for _, key in waiting if key in before}
     to_world = scene.capture_to_world(root)
-    if len(kept) < len(waiting):
+    missing = {key: stroke for stroke, key in waiting if key not in placed}
+    if missing:
+        until = time.monotonic() + _AT_ONCE
         to_capture = np.linalg.inv(to_world)
-        positions = PointPicker(root, view_layer, space).positions @ to_capture[:3, :3].T + to_capture[:3, 3]
-        for stroke, key in waiting:
-            if key not in _placed:
-                try:
-                    _placed[key] = on_surface(stroke, positions)
-                except (KeyError, TypeError, ValueError, IndexError):  # Those on photos have no camera.
-                    _placed[key] = np.zeros((0, 3))
+        positions = shown_positions(root, view_layer, space, _MOST_POINTS) @ to_capture[:3, :3].T + to_capture[:3, 3]
+        for key, stroke in missing.items():
+            try:
+                placed[key] = on_surface(stroke, positions)
+            except (KeyError, TypeError, ValueError, IndexError):  # Those on photos have no camera.
+                placed[key] = np.zeros((0, 3))
+            if time.monotonic() > until:
+                break
+        if not missing.keys() <= placed.keys() and not bpy.app.timers.is_registered(drawing.redraw):
+            bpy.app.timers.register(drawing.redraw, first_interval=0.0)
     colors = {item.object_id: tuple(item.color) for item in root.objectgs.marked}
     return [
-        (_placed[key] @ to_world[:3, :3].T + to_world[:3, 3], colors.get(stroke["object"], _WHITE))
+        (placed[key] @ to_world[:3, :3].T + to_world[:3, 3], colors.get(stroke["object"], _WHITE))
         for stroke, key in waiting
-        if len(_placed[key])
+        if len(placed.get(key, ()))
     ]
 
 

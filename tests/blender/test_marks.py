@@ -442,6 +442,25 @@ def test_lines_of_strokes_stay_until_the_strokes_are_answered(root, session):
     assert not lines_of(root)
 
 
+def test_lines_of_many_strokes_on_a_large_scene_do_not_block_blender(root, session, monkeypatch):
+    """A redraw places them in few of the splats, and no more than it has time for."""
+    counts, place = [], stroke_lines.on_surface
+    monkeypatch.setattr(stroke_lines, "on_surface", lambda *given: counts.append(len(given[1])) or place(*given))
+    monkeypatch.setattr(stroke_lines, "_MOST_POINTS", 50)
+    monkeypatch.setattr(stroke_lines, "_AT_ONCE", 0.0)
+    other = bpy.data.collections.new("other")
+    middle = pixel(views(root)[0], world_of(root))
+    for i in range(3):
+        marks.add_stroke(root, 1, views(root)[0], [tuple(middle), tuple(middle + i + 1)], area=False)
+    for known in (1, 2, 3):
+        assert len(lines_of(root)) == known
+        assert bpy.app.timers.is_registered(drawing.redraw) is (known < 3)
+        if known < 3:
+            bpy.app.timers.unregister(drawing.redraw)
+        assert not stroke_lines.lines(other, bpy.context.view_layer, None), "in another window"
+    assert len(counts) == 3 and 0 < max(counts) <= 50
+
+
 def test_no_line_is_drawn_of_strokes_that_are_replaced_or_have_no_camera(root, session):
     marks.add_stroke(root, 1, views(root)[0], [(1, 1), (9, 1)], area=False)
     pointing.propose(root)
