@@ -1122,6 +1122,17 @@ def test_transforms_stay_in_the_axes_of_the_world_after_orientation(root, folder
     assert (folder / "objects.json").read_bytes() == stored
 
 
+def test_typed_transforms_are_kept_when_the_capture_is_shown_again(root, folder, parts_shown):
+    pivot = parts_shown[0]
+    pivot.rotation_euler.z, pivot.scale.x = math.radians(270.0), -1.0
+    blender_scene.store_placements(root)
+    typed = fields(pivot)
+    blender_scene.show_capture(bpy.context.scene, folder, root)
+    assert fields(pivot) == typed
+    show_again(root)
+    assert fields(pivot) == typed
+
+
 def test_empties_of_objects_are_drawn_in_the_size_of_their_objects(root, parts_shown):
     def drawn(pivot) -> float:
         bpy.context.view_layer.update()

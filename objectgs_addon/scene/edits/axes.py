@@ -32,8 +32,7 @@ def give_axes(pivot: bpy.types.Object, parent: bpy.types.Object) -> None:
 
     The caller sets the transforms of the pivot and its parts. A parent empty that is scaled to zero changes nothing.
     """
-    world = map_to(parent, None)
-    world[:3, :3] = world[:3, :3].astype(np.float32)  # As Blender stores it for the parts.
+    world = _axes_of_world(parent)
     if not is_singular(world):
         pivot[AXES] = world.reshape(-1).tolist()
 
@@ -41,16 +40,30 @@ def give_axes(pivot: bpy.types.Object, parent: bpy.types.Object) -> None:
 def renew_axes(root: bpy.types.Collection, parent: bpy.types.Object) -> None:
     """Let transforms be in the axes of the world again after the add-on has moved the parent empty.
 
-    Nothing moves. Pivots that are animated keep their axes, since their keyframes are in these.
+    Nothing moves. Pivots that are animated keep their axes, since their keyframes are in these, and where the parent
+    empty has not moved, transforms keep the numbers that the user has given them.
     """
-    for collection in chain(object_collections(root).values(), *duplicates_of(root).values()):
-        pivot = part_of(collection, OBJECT_PARENT)
-        if pivot is None or AXES not in pivot or pivot.parent != parent or pivot.animation_data or pivot.constraints:
-            continue
+    world = _axes_of_world(parent)
+    collections = chain(object_collections(root).values(), *duplicates_of(root).values())
+    pivots = [
+        pivot
+        for pivot in (part_of(collection, OBJECT_PARENT) for collection in collections)
+        if pivot is not None
+        and AXES in pivot
+        and pivot.parent == parent
+        and not (pivot.animation_data or pivot.constraints or np.array_equal(_axes(pivot), world))
+    ]
+    if not pivots or is_singular(world):
+        return
+    # For each pivot, Blender would search all objects for its children.
+    children: dict[bpy.types.Object, list[bpy.types.Object]] = {}
+    for obj in bpy.data.objects:
+        children.setdefault(obj.parent, []).append(obj)
+    for pivot in pivots:
         local, before = map_to(pivot, parent), np.linalg.inv(part_axes(pivot))
         give_axes(pivot, parent)
         after = part_axes(pivot)
-        for child in pivot.children:
+        for child in children.get(pivot, ()):
             relative = np.round(before @ np.array(child.matrix_parent_inverse, np.float64), DIGITS)
             child.matrix_parent_inverse = Matrix((after @ relative).tolist())
         set_local_map(pivot, local @ np.linalg.inv(after @ before))
@@ -125,6 +138,13 @@ def _current_inverse(obj: bpy.types.Object) -> np.ndarray:
     """Return the parent inverse of an object, (4, 4) float64, not rounded if it is as `put_below` sets it."""
     stored, exact = np.array(obj.matrix_parent_inverse, np.float64), _parent_inverse(obj)
     return exact if np.array_equal(exact.astype(np.float32), stored) else stored
+
+
+def _axes_of_world(parent: bpy.types.Object) -> np.ndarray:
+    """Return the `AXES` of pivots below a parent empty as it is, (4, 4) float64."""
+    world = map_to(parent, None)
+    world[:3, :3] = world[:3, :3].astype(np.float32)  # As Blender stores it for the parts.
+    return world
 
 
 def _axes(pivot: bpy.types.Object | None) -> np.ndarray:
