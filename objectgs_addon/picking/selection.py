@@ -73,9 +73,12 @@ def selected_collections(context: bpy.types.Context, root: bpy.types.Collection)
 
 def select_shown_parts(view_layer: bpy.types.ViewLayer, root: bpy.types.Collection) -> None:
     """Select the visible parts of objects and duplicates of which any part is selected, such as new meshes."""
+    found = drawing.collections_by_part()
+    selected = {found[part] for part in view_layer.objects.selected if part in found} & set(root.children_recursive)
+    if not selected:
+        return
     view_layer.update()
-    collections = {scene.collection_of(part) for part in view_layer.objects.selected}
-    for collection in collections & set(root.children_recursive):
+    for collection in selected:
         for part in scene.parts_of(collection):
             if part.visible_get(view_layer=view_layer) and not part.hide_select:
                 part.select_set(True, view_layer=view_layer)

@@ -840,6 +840,20 @@ def test_selected_objects_stay_outlined_when_meshes_replace_splats(active, folde
     assert splats.select_get() and not mesh_of(active, 1).select_get() and not other.select_get()
 
 
+def test_outlines_of_many_objects_are_kept_without_a_search_for_each(active, monkeypatch):
+    """Nor is a view layer evaluated in which nothing is selected."""
+
+    def fails(*_):
+        raise AssertionError
+
+    monkeypatch.setattr(blender_scene, "collection_of", fails)
+    selection.select_shown_parts(SimpleNamespace(objects=SimpleNamespace(selected=[]), update=fails), active)
+    active.objectgs.shown = "splats"
+    selection.select_object(bpy.context, active, 1)
+    active.objectgs.shown = "meshes"
+    assert mesh_of(active, 1).select_get() and not mesh_of(active, 2).select_get()
+
+
 def test_panel_tells_which_mode_shows_textures(active):
     window = bpy.context.window_manager.windows[0]
     area = next(area for area in window.screen.areas if area.type == "VIEW_3D")
