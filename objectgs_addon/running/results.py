@@ -68,9 +68,15 @@ def _shown_roots(job: Job, owner: bpy.types.Scene | None) -> list[bpy.types.Coll
 
 
 def _show_capture(job: Job, owner: bpy.types.Scene | None) -> bool:
-    """Show a capture and, where they are not shown yet, the splats that were trained on it, not on other poses."""
+    """Show a capture and, where they are not shown yet, the splats that were trained on it.
+
+    Beside splats that were trained on other poses, the capture is not hidden, so that the new poses can be checked.
+    """
     shown = _show_points(job, owner)
-    if not folder_state(_folder_of(job)).outdated and not all(map(scene.object_collections, _shown_roots(job, owner))):
+    if folder_state(_folder_of(job)).outdated:
+        for root in _shown_roots(job, owner):
+            view.hide_capture(root, False)
+    elif not all(map(scene.object_collections, _shown_roots(job, owner))):
         _show_result(job, owner)
     return shown
 

@@ -32,15 +32,18 @@ def show(root: bpy.types.Collection) -> None:
                     _look_as(area.spaces.active, cameras)
 
 
-def hide_capture(root: bpy.types.Collection) -> None:
-    """Hide the capture when splats or meshes replace it: its points also in instances, its cameras in view layers."""
+def hide_capture(root: bpy.types.Collection, is_hidden: bool = True) -> None:
+    """Hide the capture when splats or meshes replace it: its points also in instances, its cameras in view layers.
+
+    is_hidden: False shows it again.
+    """
     points = [part for part in root.all_objects if scene.kind_of(part) == "points"]
     for part in points:  # Hiding frees the list of the collection's objects.
-        part.hide_viewport = True
+        part.hide_viewport = is_hidden
     for owner in object_list.scenes_of(root):
         for view_layer in owner.view_layers:
             if (layer := visibility.capture_layer(view_layer, root)) is not None:
-                layer.hide_viewport = True
+                layer.hide_viewport = is_hidden
 
 
 def show_kinds(root: bpy.types.Collection, which: str) -> None:

@@ -711,6 +711,21 @@ def test_import_shows_only_splats_of_its_poses(extension, folder, monkeypatch, i
     assert bool(scene.object_collections(bpy.context.scene.objectgs.active)) is not is_outdated
 
 
+def test_new_poses_of_a_trained_capture_are_visible(extension, folder, monkeypatch):
+    background.finish(imported(folder))
+    root, layer = bpy.context.scene.objectgs.active, bpy.context.view_layer
+
+    def seen() -> list[bool]:
+        layer.update()
+        return [part.visible_get() for part in root.all_objects if scene.kind_of(part) in ("camera", "points")]
+
+    assert scene.object_collections(root) and not any(seen())
+    state = dataclasses.replace(folder_state(folder), outdated=True)
+    monkeypatch.setattr(results, "folder_state", lambda _folder: state)
+    background.finish(imported(folder))
+    assert len(seen()) > 1 and all(seen())
+
+
 def test_folder_that_fails_does_not_stop_other_jobs(shown, folder, tmp_path, monkeypatch):
     """As a folder on a network at the moment when a job ends."""
 
