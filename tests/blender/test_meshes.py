@@ -576,6 +576,7 @@ def corner_normals(obj) -> np.ndarray:
     turn = np.array(obj.matrix_world)[:3, :3]
     places = coordinates(obj)[[loop.vertex_index for loop in obj.data.loops]]
     normals = np.array([loop.normal for loop in obj.data.loops]) @ turn.T
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return np.array(sorted({tuple(np.round(row, 3)) for row in np.hstack([places, normals])}))
 
 
@@ -601,6 +602,26 @@ def test_exported_objects_have_their_rotation_and_no_other(root, tmp_path):
         assert np.array(obj.matrix_world) == pytest.approx(np.array(source.matrix_world), abs=1e-5)
     assert np.array(found[0].matrix_world)[:3, :3] == pytest.approx(np.eye(3), abs=1e-5)
     assert corner_normals(found[0]) == pytest.approx(corner_normals(mesh), abs=2e-3)
+
+
+def test_exported_scene_mesh_is_not_turned(fresh, folder, tmp_path, monkeypatch):
+    write_vertices(folder / "splats.ply", splat_table(np.zeros(20, int)))
+    write_meshes(folder, {"scene": tetrahedron(ORIGIN)})
+    root = blender_scene.show_capture(bpy.context.scene, folder)
+    blender_scene.show_result(root, folder)
+    blender_scene.scale_to_distance(root, (0, 0, 0), (1, 0, 0), 2.0)
+    (mesh,) = blender_scene.scene_meshes(root)
+    mesh_export.export(root, tmp_path / "scene.glb", "glb", None, False, False)
+    before = set(bpy.data.objects)
+    bpy.ops.import_scene.gltf(filepath=str(tmp_path / "scene.glb"))
+    bpy.context.view_layer.update()
+    (found,) = [obj for obj in set(bpy.data.objects) - before if obj.type == "MESH"]
+    assert np.array(found.matrix_world)[:3, :3] == pytest.approx(np.eye(3), abs=1e-5)
+    assert corner_normals(found) == pytest.approx(corner_normals(mesh), abs=2e-3)
+    counts = [len(bpy.data.meshes)]
+    monkeypatch.setattr(mesh_export, "_write", lambda *_: counts.append(len(bpy.data.meshes)))
+    mesh_export.export(root, tmp_path / "scene.obj", "obj", None, False, False)
+    assert counts == counts[:1] * 2, "an OBJ file needs no copies"
 
 
 def test_export_keeps_shear(root, tmp_path):

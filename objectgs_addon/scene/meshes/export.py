@@ -15,9 +15,11 @@ from mathutils import Matrix
 from ....backend.shared.errors import InputError
 from ....backend.shared.formats.file_names import distinct_stems
 from ....backend.shared.reconstruction.folder import Reconstruction
+from ....backend.shared.reconstruction.objects import is_singular
 from ... import scene
 from ...blender.quiet import quiet
-from ..edits.axes import part_axes
+from ..edits.axes import AXES, map_to, part_axes
+from ..kinds import parent_of
 from ..object_collection import our_materials
 from .shading import lit
 
@@ -101,7 +103,8 @@ def export(
         path.parent.mkdir(parents=True, exist_ok=True)
         # Other formats than GLB have textures beside them, where those of another file must not be replaced.
         prefix = "" if suffix == "glb" else f"{bpy.path.clean_name(path.stem)}_"
-        with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, prefix):
+        bakes = not in_capture and suffix in _EXPORTERS  # OBJ files have no rotations.
+        with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, bakes, prefix):
             _write(path, suffix, in_capture)
     return list(parts_of)
 
@@ -141,9 +144,10 @@ def _write(path: Path, suffix: str, in_capture: bool) -> None:
 
 
 @contextmanager
-def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str) -> Any:
+def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, bakes: bool, prefix: str) -> Any:
     """Show a temporary scene with visible copies of the meshes in the window.
 
+    With `bakes`, the capture's rotation and scale are part of the vertices, so that those of the copies are the user's.
     Recolored textures are replaced by recolored images, since exporters do not support the recolor node group. With a
     prefix, all textures are replaced by copies whose files' names begin with it.
     """
@@ -175,8 +179,7 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
                 obj.constraints.clear()
                 # Exporters evaluate other frames.
                 obj.animation_data_clear()
-                # An object that was not turned is not turned in other programs either.
-                baked = np.eye(4) if in_capture else part_axes(mesh.parent)
+                baked = _capture_axes(root, mesh) if bakes else np.eye(4)
                 wanted = place @ np.linalg.inv(baked)
                 obj.matrix_basis = Matrix(wanted.tolist())
                 difference = np.array(obj.matrix_basis)[:3, :3] - wanted[:3, :3]
@@ -225,6 +228,19 @@ def _stage(root: bpy.types.Collection, parts: Any, in_capture: bool, prefix: str
         for original, name in names.items():
             if original.library is None:
                 original.name = name
+
+
+def _capture_axes(root: bpy.types.Collection, mesh: bpy.types.Object) -> np.ndarray:
+    """Return the rotation and scale that a mesh has from the capture, (4, 4).
+
+    It is that of the pivot's axes; meshes of the whole scene and objects of earlier versions have none of these.
+    """
+    if mesh.parent is not None and AXES in mesh.parent:
+        return part_axes(mesh.parent)
+    found, parent = np.eye(4), parent_of(root)
+    if parent is not None:
+        found[:3, :3] = map_to(parent, None)[:3, :3]
+    return np.eye(4) if is_singular(found) else found
 
 
 def _take_name(copy: bpy.types.ID, original: bpy.types.ID, names: dict[bpy.types.ID, str]) -> None:
