@@ -146,7 +146,7 @@ def test_room_for_intersections_is_that_of_the_largest_of_the_last_images(monkey
 
 @pytest.mark.parametrize(
     ("primitive", "wanted"),
-    [("3d", name) for name in ("", "labels", *PLANES[:2])] + [("2d", name) for name in ("", "labels", *PLANES)],
+    [("3d", name) for name in ("", "labels", *PLANES[:3])] + [("2d", name) for name in ("", "labels", *PLANES)],
 )
 def test_single_plane_matches_all_planes(wanted, primitive):
     flat = primitive == "2d"
@@ -162,8 +162,8 @@ def test_single_plane_matches_all_planes(wanted, primitive):
             **wanted_planes,
         )  # fmt: skip
         here = [rendered.color, rendered.alpha]
-        for name, plane in zip(("labels", *PLANES), rendered[2:7], strict=True):
-            assert (plane is not None) == ((everything and (flat or name in ("labels", *PLANES[:2]))) or name == wanted)
+        for name, plane in zip(("labels", *PLANES), rendered[2:8], strict=True):
+            assert (plane is not None) == ((everything and (flat or name in ("labels", *PLANES[:3]))) or name == wanted)
             if name == wanted:
                 here.append(plane)
         planes.append([plane.detach().numpy() for plane in here])
