@@ -198,8 +198,8 @@ def _draw_display(layout: bpy.types.UILayout, context: bpy.types.Context, root: 
     if layer is not None and any(obj.type == "CAMERA" for obj in layer.collection.objects):
         row = layout.row()
         row.alignment = "LEFT"
-        icon = "HIDE_ON" if layer.hide_viewport else "HIDE_OFF"
-        row.prop(layer, "hide_viewport", text="Cameras", icon=icon, emboss=False)
+        # Blender draws the open or closed eye of this property by itself.
+        row.prop(layer, "hide_viewport", text="Cameras", emboss=False)
 
 
 def _draw_folder(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
