@@ -23,6 +23,7 @@ from ...mesh.views import Views
 from ...model.draw import draw
 from ...pointing.clusters import nested_clusters
 from ...pointing.random_walker import connected_with, random_walker
+from ...raster.ranked_ids import add_ranked
 from ...shared.events import Reporter
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StopRequest
@@ -66,6 +67,9 @@ class SmallScene:
         rendering = draw(trainer.model, trainer.scene.camera(0), want_depth=True)
         if not np.isfinite(rendering.image).all():
             raise RuntimeError("a short training rendered an image that is not finite")
+        # As the frames of films.
+        one = np.ones((1, 1, 1), np.float32)
+        add_ranked(-one.astype(np.int32), 0 * one, one.astype(np.int32), one)
         return trainer
 
     def train_discs(self) -> None:
