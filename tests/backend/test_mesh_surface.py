@@ -136,11 +136,12 @@ def test_depth_is_not_that_of_what_shines_through():
     front, back = sheet(0.0, 2), sheet(-2.0, 2, half=0.8)
     both = together(front._replace(opacities=front.opacities * 0.5), back)
     both = both._replace(
-        quats=torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(both.means), 1), scales=torch.full_like(both.scales, 0.025)
+        quats=torch.tensor([[0.5, 0.5, 0.5, 0.5]]).repeat(len(both.means), 1),
+        scales=torch.full_like(both.scales, 0.025),
     )
     found = views_of(both, [camera_at((4, 0, 0))], primitive="2d").object_view(0, [2])
     y, x = 24 - found.y, 32 - found.x
-    assert 0.5 < found.alpha[y, x] and found.depth[y, x] == pytest.approx(4.0, abs=0.01)
+    assert found.alpha[y, x] > 0.5 and found.depth[y, x] == pytest.approx(4.0, abs=0.01)
 
 
 def test_unlabeled_pixels_beside_object_are_not_visible():
