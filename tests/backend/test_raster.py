@@ -155,12 +155,18 @@ def test_filter_of_other_programs_matches_reference():
     assert not torch.allclose(got.alpha, rasterize(**as_float32(scene), camera=camera()).alpha, atol=0.1)
 
 
+def broad_layers(depths):
+    """Return a splat at each depth, broader than the image; the caller sets their opacities."""
+    layers = random_scene(0, count=len(depths), size=30.0)
+    layers["means"] = torch.tensor([[0, 0, z] for z in depths], dtype=torch.float64)
+    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * len(depths))
+    layers["scales"][:] = 1e3
+    return layers
+
+
 def test_median_depth_is_at_half_transmittance():
     cam = camera()
-    layers = random_scene(0, count=4, size=30.0)
-    layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 5.0)], dtype=torch.float64)
-    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 4)
-    layers["scales"][:] = 1e3
+    layers = broad_layers((2.0, 3.0, 4.0, 5.0))
     for opacities, depth in (
         ((0.3, 0.2, 0.2, 0.2), 4.0), ((0.3, 0.5, 0.9, 0.9), 3.0), ((0.6, 0.9, 0.9, 0.9), 2.0), ((0.1,) * 4, 0.0)
     ):  # fmt: skip
@@ -171,10 +177,7 @@ def test_median_depth_is_at_half_transmittance():
 
 def test_surface_depth_is_the_mean_up_to_the_median():
     cam = camera()
-    layers = random_scene(0, count=4, size=30.0)
-    layers["means"] = torch.tensor([[0, 0, z] for z in (2.0, 3.0, 4.0, 50.0)], dtype=torch.float64)
-    layers["quats"] = torch.tensor([[1.0, 0, 0, 0]] * 4)
-    layers["scales"][:] = 1e3
+    layers = broad_layers((2.0, 3.0, 4.0, 50.0))
     for opacities, depth in (
         ((0.4, 0.5, 0.9, 0.9), (0.4 * 2 + 0.3 * 3) / 0.7), ((0.6, 0.9, 0.9, 0.9), 2.0),
         ((0.1, 0.1, 0.1, 0.1), (0.1 * 2 + 0.09 * 3 + 0.081 * 4 + 0.0729 * 50) / 0.3439),
