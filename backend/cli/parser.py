@@ -353,8 +353,9 @@ def _add_export(commands: _Commands) -> None:
     options.add_reconstruction(export)
     export.add_argument("--out", type=Path, required=True, metavar="PATH", help="file, or folder with --per-object")
     export.add_argument(
-        "--format", choices=("ply", "spz", "splat"), help="file format (default: by the file's suffix, else ply)"
-    )
+        "--format", choices=("ply", "spz", "splat", "glb", "usdc"),
+        help="file format (default: by the file's suffix, else ply)",
+    )  # fmt: skip
     export.add_argument(
         "--objects", action="extend", nargs="+", metavar="OBJECT", help="names or IDs (default: everything)"
     )
@@ -380,8 +381,9 @@ def _add_export(commands: _Commands) -> None:
         "all.ply, all-1.ply has a fourth, all-2.ply a sixteenth, and so on",
     )  # fmt: skip
     export.add_argument(
-        "--no-ids", action="store_true", help="omit object_id from PLY, for programs that cannot read it"
-    )
+        "--no-ids", action="store_true",
+        help="omit object_id from PLY, for programs that cannot read it, and do not split glTF and USD into objects",
+    )  # fmt: skip
     export.add_argument(
         "--bake-background", action="store_true",
         help="add a sphere of splats in the color behind the scene, for programs that draw splats on black",

@@ -203,7 +203,8 @@ the earlier one.
 
 EXPORT = """\
 Export the splats, with all edits, for other programs: as PLY (exact, with object_id),
-SPZ (a fifth of the size) or .splat (one color per splat).
+SPZ (a fifth of the size), .splat (one color per splat), or glTF (.glb) or USD (.usdc)
+with each object apart.
 """
 
 IMPORT_SPLATS = """\

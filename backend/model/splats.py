@@ -117,6 +117,18 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     )
 
 
+def objects_of(splats: Splats) -> list[tuple[int, Splats, NDArray[np.float64]]]:
+    """Return the ID, the splats and the center (3,) of their means' bounds of each object that has splats, by ID."""
+    ids, counts = np.unique(splats.object_ids, return_counts=True)
+    rows = np.split(np.argsort(splats.object_ids, kind="stable"), np.cumsum(counts)[:-1])
+    found = []
+    for object_id, own in zip(ids.tolist(), rows, strict=True):
+        part = splats.select(own)
+        low, high = part.means.min(0).astype(np.float64), part.means.max(0).astype(np.float64)
+        found.append((object_id, part, (low + high) / 2))
+    return found
+
+
 def gathered(parts: Iterable[Splats], most: int) -> Splats:
     """Concatenate splats while they are made, so that there is no second copy of them.
 

@@ -19,13 +19,15 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
     bl_description = "Export the splats with all edits: without removed objects, recolored, moved, and with duplicates"
     bl_options = {"REGISTER"}
 
-    filter_glob: StringProperty(default="*.ply;*.spz;*.splat", options={"HIDDEN"})
+    filter_glob: StringProperty(default="*.ply;*.spz;*.splat;*.glb;*.usdc", options={"HIDDEN"})
     format: EnumProperty(
         name="Format",
         items=[
             ("ply", "PLY", "The format of 3D Gaussian splatting programs: exact, with object IDs"),
             ("spz", "SPZ", "About a fifth of the size, slightly rounded"),
             ("splat", "Splat", "For web viewers: one color per splat, independent of the view direction"),
+            ("glb", "glTF", "KHR_gaussian_splatting: exact, each object a node with its name"),
+            ("usdc", "USD", "ParticleField3DGaussianSplat of OpenUSD 26.03: exact, each object a prim with its name"),
         ],
     )
     objects: objects_choice("Everything except objects that are removed or left out")
@@ -36,8 +38,8 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
             (
                 "blender",
                 "Blender",
-                "Positions in Blender, with Set Ground and Set Distance. PLY and Splat are Z up, as USD meshes; SPZ is "
-                "Y up, as glTF and OBJ meshes",
+                "Positions in Blender, with Set Ground and Set Distance. PLY, Splat and USD are Z up, as USD meshes; "
+                "SPZ and glTF are Y up, as glTF and OBJ meshes",
             ),
         ],
     )

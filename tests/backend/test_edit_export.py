@@ -6,6 +6,7 @@ import gzip
 import json
 import shutil
 import struct
+import sys
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,14 +14,16 @@ import numpy as np
 import pytest
 import torch
 from plyfile import PlyData
+from pxr import Usd, UsdGeom, UsdVol
 from scipy.spatial.transform import Rotation
 
 from backend.commands.cameras import read_upright, write_splat_cameras
 from backend.editing import apply_edits, transformed
 from backend.editing.placement import middle_of
-from backend.export import coarser_splats, read_splats, write_splat, write_splats, write_spz
+from backend.export import coarser_splats, read_splats, write_gltf, write_splat, write_splats, write_spz, write_usd
 from backend.model.splats import Splats
 from backend.raster import Camera, rasterize
+from backend.shared.color import srgb
 from backend.shared.errors import EXIT_DONE, InputError
 from backend.shared.formats.json_file import write_json
 from backend.shared.formats.ply import read_vertices
@@ -235,7 +238,7 @@ def test_export_without_edits_equals_splats_ply(run_command, folder, tmp_path):
 
 def test_export_refuses_unknown_suffixes(run_command, folder, tmp_path):
     result = run_command("export", folder.folder, "--out", tmp_path / "all.sog")
-    assert_rejected(result, "all.sog", "written as .ply, .spz or .splat")
+    assert_rejected(result, "all.sog", "written as .ply, .spz, .splat, .glb or .usdc")
     assert not (tmp_path / "all.sog").exists()
     assert run_command("export", folder.folder, "--out", tmp_path / "all.v2", "--format", "spz").code == EXIT_DONE
     assert run_command("export", folder.folder, "--out", tmp_path / "parts.v2", "--per-object").code == EXIT_DONE
@@ -417,6 +420,137 @@ def test_spz_matches_gsply_reader(tmp_path):
     np.testing.assert_allclose(found.shN, mine.sh[:, 1:], atol=1e-6)
     np.testing.assert_allclose(found.sh0, mine.sh[:, 0], atol=1e-5)
     np.testing.assert_allclose(np.abs((found.quats * mine.quats).sum(1)), 1, atol=1e-5)
+
+
+def read_gltf(path):
+    """Decode the splats of a GLB, node by node, as specified: object ID -> (name, splats, COLOR_0)."""
+    data = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack_from("<4sIIII", data)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
+    content = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack_from("<II", data, 20 + size)
+    binary = data[28 + size :]
+    assert kind == 0x004E4942 and binary_size == len(binary) == content["buffers"][0]["byteLength"]
+    assert content["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    found = {}
+    for index in content["scenes"][content["scene"]]["nodes"]:
+        node = content["nodes"][index]
+        (primitive,) = content["meshes"][node["mesh"]]["primitives"]
+        assert primitive["mode"] == 0, "points"
+        properties = primitive["extensions"]["KHR_gaussian_splatting"]
+        assert properties == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        values = {}
+        for name, number in primitive["attributes"].items():
+            accessor = content["accessors"][number]
+            view = content["bufferViews"][accessor["bufferView"]]
+            width, kind = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]], accessor["componentType"]
+            dtype, one = {5126: (np.dtype("<f4"), 1), 5123: (np.dtype("<u2"), 65535)}[kind]
+            assert accessor.get("normalized", False) == (one > 1) and view["byteOffset"] % 4 == 0
+            assert view["byteLength"] == accessor["count"] * width * dtype.itemsize
+            numbers = np.frombuffer(binary, dtype, accessor["count"] * width, view["byteOffset"])
+            values[name] = numbers.reshape(-1, width) / one
+        low, high = content["accessors"][primitive["attributes"]["POSITION"]]["min"], values["POSITION"].min(0)
+        np.testing.assert_array_equal(np.float32(low), high)
+        bands = [
+            f"KHR_gaussian_splatting:SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in range(2 * degree + 1)
+        ]
+        count = len(values["POSITION"])
+        splats = Splats(
+            values["POSITION"] + np.array(node["translation"]),
+            values["KHR_gaussian_splatting:ROTATION"][:, [3, 0, 1, 2]],
+            values["KHR_gaussian_splatting:SCALE"],
+            values["KHR_gaussian_splatting:OPACITY"][:, 0],
+            np.stack([values[band] for band in bands if band in values], 1),
+            np.full(count, node["extras"]["object_id"]),
+        )
+        found[node["extras"]["object_id"]] = node["name"], splats, values["COLOR_0"]
+    return found
+
+
+def read_usd(path):
+    """Read the splats of a USD file by its schema: object ID -> (display name, splats)."""
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    cache = UsdGeom.XformCache()
+    found = {}
+    for prim in stage.GetDefaultPrim().GetChildren():
+        field = UsdVol.ParticleField3DGaussianSplat(prim)
+        assert prim.GetTypeName() == "ParticleField3DGaussianSplat" and field.GetPositionsAttr().IsDefined()
+        place = np.array(cache.GetLocalToWorldTransform(prim))
+        np.testing.assert_array_equal(place[:3, :3], np.eye(3))
+        means = np.array(field.GetPositionsAttr().Get()) + place[3, :3]
+        quats = [(quat.GetReal(), *quat.GetImaginary()) for quat in field.GetOrientationsAttr().Get()]
+        degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+        sh = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get()).reshape(-1, (degree + 1) ** 2, 3)
+        object_id = prim.GetAttribute("userProperties:object_id").Get()
+        scales = np.array(field.GetScalesAttr().Get())
+        low, high = np.array(field.GetExtentAttr().Get()) + place[3, :3]
+        assert (low <= means.min(0) - scales.min()).all() and (high >= means.max(0) + scales.min()).all()
+        splats = Splats(
+            means, np.array(quats), scales, np.array(field.GetOpacitiesAttr().Get()), sh, np.full(len(means), object_id)
+        )
+        found[object_id] = prim.GetDisplayName(), splats
+    return found
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("coordinates", ["capture", "blender"])
+def test_gltf_and_usd_keep_each_object_apart(run_command, folder, tmp_path, degree, coordinates):
+    write_splats(folder.splats, some_splats(degree=degree))
+    edit_objects(folder.objects, {3: {"name": "Blue box"}})
+    run_command("edit", folder.folder, "--move", "can:x=0.5", "--remove", "mug")
+    for kind in ("ply", "glb", "usdc"):
+        run_command("export", folder.folder, "--out", tmp_path / f"a.{kind}", "--coordinates", coordinates)
+    whole = read_splats(tmp_path / "a.ply")[0]
+    turned = whole
+    if coordinates == "blender":
+        turned = transformed(whole, np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]))
+    gltf, usd = read_gltf(tmp_path / "a.glb"), read_usd(tmp_path / "a.usdc")
+    names = {0: "Background", 2: "Blue box", 3: "Blue box", 7: "can"}
+    assert {i: each[0] for i, each in gltf.items()} == {i: each[0] for i, each in usd.items()} == names
+    for every, read in ((turned, gltf), (whole, usd)):
+        for object_id, (_, found, *_) in read.items():
+            wanted = every.select(every.object_ids == object_id)
+            np.testing.assert_allclose(found.means, wanted.means, atol=1e-6)
+            np.testing.assert_allclose(np.abs((found.quats * wanted.quats).sum(1)), 1, atol=1e-6)
+            np.testing.assert_allclose(found.scales, wanted.scales, rtol=1e-6)
+            np.testing.assert_allclose(found.opacities, wanted.opacities, atol=1e-6)
+            np.testing.assert_allclose(found.sh, wanted.sh, atol=1e-5)
+    for _, found, color in gltf.values():
+        linear = srgb.decode(np.clip(0.5 + C0 * found.sh[:, 0], 0, 1))
+        np.testing.assert_allclose(color, np.column_stack([linear, found.opacities]), atol=1e-5)
+
+
+def test_gltf_and_usd_without_ids_are_of_one_part(run_command, folder, tmp_path):
+    for kind, read in (("glb", read_gltf), ("usdc", read_usd)):
+        run_command("export", folder.folder, "--out", tmp_path / f"all.{kind}", "--no-ids")
+        ((name, splats, *_),) = read(tmp_path / f"all.{kind}").values()
+        assert name == "all" and len(splats) == 60
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.glb", "all.usdc", "made"]
+
+
+def test_gltf_and_usd_are_exact_far_from_the_origin(tmp_path):
+    near = some_splats()
+    far = replace(near, means=near.means + np.array([4e5, -3e6, 100]))
+    for write, read, kind in ((write_gltf, read_gltf, "glb"), (write_usd, read_usd, "usdc")):
+        write(tmp_path / f"far.{kind}", far, {0: "ü / 1", 1: "ü / 1", 2: "con", 3: "", 7: "杯"})
+        for object_id, (_, found, *_) in read(tmp_path / f"far.{kind}").items():
+            wanted = far.select(far.object_ids == object_id)
+            assert np.abs(found.means - wanted.means).max() < 1e-6
+
+
+def test_usd_needs_its_package(run_command, folder, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    result = run_command("export", folder.folder, "--out", tmp_path / "all.usdc")
+    assert_rejected(result, "all.usdc", "lacks the package usd-core")
+    assert not (tmp_path / "all.usdc").exists()
+
+
+def test_gltf_of_too_many_splats_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("backend.export.gltf._LARGEST", 9000)
+    with pytest.raises(InputError, match="more than a glTF file can"):
+        write_gltf(tmp_path / "many.glb", some_splats(), dict.fromkeys((0, 1, 2, 3, 7), "part"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_spz_limits_are_reported(tmp_path, monkeypatch):

@@ -1574,6 +1574,9 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
     assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
     table = read_vertices(tmp_path / "all.ply")
     assert set(table["object_id"].tolist()) == {0, 2, HUGE}
+    for kind in ("glb", "usdc"):
+        bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), format=kind)
+        assert (tmp_path / f"all.{kind}").stat().st_size > 10_000
     moved = np.array(entry(root, 2).transform)[:3, 3]
     assert moved == pytest.approx(in_capture(root, (1.0, 0.0, 0.0)), abs=1e-4)
     assert bpy.ops.objectgs.import_splats(filepath=str(tmp_path / "all.ply"), folder=str(tmp_path / "again")) == {

@@ -169,7 +169,7 @@ def _command_for(folder: Path, templates: Templates, rng: random.Random) -> list
         "render": ["render", out],
         "mesh": ["mesh", out, "--objects", 1, "--faces", 150, "--texture-size", 256, *rng.choice(([], ["--restart"]))],
         "edit": ["edit", out, *rng.choice((["--remove", "1", "--fill"], ["--reset", "all"], ["--move", "2:x=1"]))],
-        "export": ["export", out, "--out", made / f"splats.{rng.choice(('ply', 'spz', 'splat'))}"],
+        "export": ["export", out, "--out", made / f"splats.{rng.choice(('ply', 'spz', 'splat', 'glb', 'usdc'))}"],
         "film": ["film", out, "--shot", templates.shot, "--out", made],
         "evaluate": ["evaluate", out],
         "report": ["report", out],

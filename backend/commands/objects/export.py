@@ -11,7 +11,17 @@ import numpy as np
 
 from ...capture import Upright
 from ...editing import apply_edits, apply_splat_edits, transformed
-from ...export import DOWN_TO_UP, background_sphere, coarser_splats, read_splats, write_splat, write_splats, write_spz
+from ...export import (
+    DOWN_TO_UP,
+    background_sphere,
+    coarser_splats,
+    read_splats,
+    write_gltf,
+    write_splat,
+    write_splats,
+    write_spz,
+    write_usd,
+)
 from ...model.splats import Splats, concatenate
 from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
@@ -24,7 +34,9 @@ from ...shared.stopping import StoppingReporter
 from ..cameras import read_upright
 from ..folder import READ
 
-_FORMATS = ("ply", "spz", "splat")
+_FORMATS = ("ply", "spz", "splat", "glb", "usdc")
+"""Formats, as the suffixes of their files."""
+
 _MOST_LISTED = 10
 _SKIPPED = "since those that are deleted, cropped, or of removed or left-out objects are skipped."
 _Z_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -67,14 +79,14 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         splats = splats.with_degree(options.sh_degree)
     sphere = background_sphere(splats, background) if options.bake_background and background else None
     upright = read_upright(folder)
-    splats = _in_coordinates(splats, options, upright, y_up=kind == "spz")
+    splats = _in_coordinates(splats, options, upright, kind)
     versions = {options.out: splats}
     if options.levels:
         reporter.status("Merging splats")
         for level, coarser in enumerate(coarser_splats(splats, options.levels), 1):
             versions[options.out.with_name(f"{options.out.stem}-{level}{options.out.suffix}")] = coarser
     if sphere is not None:  # Merged splats of the sphere would have gaps.
-        sphere = _in_coordinates(sphere, options, upright, y_up=kind == "spz")
+        sphere = _in_coordinates(sphere, options, upright, kind)
         versions = {path: concatenate([version, sphere]) for path, version in versions.items()}
         splats = versions[options.out]
     files = {
@@ -86,7 +98,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         folder.require_foreign(path)
     up = [0.0, 0.0, 1.0] if options.coordinates == "blender" else upright.rotation[2].tolist()
     description = Description(up, None if options.bake_background else background)
-    names = {} if options.no_ids else {entry.id: entry.name for entry in objects}
+    names = {entry.id: entry.name for entry in objects}
     reporter.begin("write", f"Writing {len(files)} file{'' if len(files) == 1 else 's'}")
     for done, (path, (version, ids)) in enumerate(files.items(), 1):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -115,13 +127,20 @@ def _format(options: argparse.Namespace) -> str:
 def _write(
     path: Path, splats: Splats, kind: str, with_ids: bool, description: Description, names: Mapping[int, str]
 ) -> list[str]:
-    """Write a file in a format, a PLY with the names of the objects in it; returns warnings."""
+    """Write a file in a format, with the IDs and names of the objects where it has them; returns warnings."""
     if kind == "spz":
         return write_spz(path, splats)
     if kind == "splat":
         return write_splat(path, splats)
-    named = {i: names[i] for i in np.unique(splats.object_ids).tolist() if i in names}
-    return write_splats(path, splats, with_ids, replace(description, names=named))
+    if kind == "ply":
+        present = np.unique(splats.object_ids).tolist() if with_ids else ()
+        return write_splats(
+            path, splats, with_ids, replace(description, names={i: names[i] for i in present if i in names})
+        )
+    if not with_ids:
+        splats, names = replace(splats, object_ids=np.zeros_like(splats.object_ids)), {0: path.stem}
+    named = {i: names.get(i, default_name(i)) for i in np.unique(splats.object_ids).tolist()}
+    return write_gltf(path, splats, named) if kind == "glb" else write_usd(path, splats, named)
 
 
 def _warn_about_others(files: Iterable[Path], reporter: StoppingReporter) -> None:
@@ -152,16 +171,20 @@ def _warn_about_fit(folder: Reconstruction, record: Record, reporter: StoppingRe
         )
 
 
-def _in_coordinates(splats: Splats, options: argparse.Namespace, upright: Upright, y_up: bool) -> Splats:
-    """Return the splats in the capture's coordinates, or as they are in Blender; SPZ has its own axes for both."""
+def _in_coordinates(splats: Splats, options: argparse.Namespace, upright: Upright, kind: str) -> Splats:
+    """Return the splats in the capture's coordinates, or as they are in Blender, in the axes of the format.
+
+    In Blender's coordinates, SPZ and glTF are Y up. In those of the capture, only SPZ, which has axes of its own,
+    differs from COLMAP.
+    """
     if options.coordinates == "blender":
         splats = replace(splats, means=splats.means.astype(np.float64) - upright.origin)
         stand = np.eye(4)
         stand[:3, :3], stand[:3, 3] = upright.rotation, upright.translation
         if options.to_world is not None:
             stand = np.array(options.to_world)
-        return transformed(splats, (_Z_TO_Y_UP if y_up else np.eye(4)) @ stand)
-    return transformed(splats, DOWN_TO_UP) if y_up else splats
+        return transformed(splats, (_Z_TO_Y_UP if kind in ("spz", "glb") else np.eye(4)) @ stand)
+    return transformed(splats, DOWN_TO_UP) if kind == "spz" else splats
 
 
 def _files(
