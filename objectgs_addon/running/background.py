@@ -93,6 +93,7 @@ def submit(job: Job, owner: bpy.types.Scene, report: Callable[[set[str], str], A
             report({"ERROR"}, f"{job.title}: {messages.sentence(error)}")
             return {"CANCELLED"}
         return {"FINISHED"}
+    messages.withdraw(after_stop(job))  # Of an earlier job with the same title, which this one continues.
     queue.add(job)
     if not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=0.0, persistent=True)
@@ -170,9 +171,10 @@ def is_busy(root: bpy.types.Collection) -> bool:
     return folder_trust.is_accepted(root) and busy(scene.folder_of(root))
 
 
-def failed_job(number: int) -> Job | None:
-    """Return the failed job with a number, or None."""
-    return next((job for job in queue.jobs if job.number == number and job.state is State.FAILED), None)
+def ended_job(number: int) -> Job | None:
+    """Return the failed or stopped job with a number, or None."""
+    ended = (State.FAILED, State.STOPPED)
+    return next((job for job in queue.jobs if job.number == number and job.state in ended), None)
 
 
 def busy(folder: Path) -> bool:
@@ -238,7 +240,7 @@ def _handle_end(job: Job) -> None:
             with contextlib.suppress(InputError, OSError):
                 messages.withdraw(_poses_told.pop(folder_trust.state_of(root).capture, ""))
     elif job.state is State.STOPPED and job.kind == "sfm":
-        messages.show(after_stop(job))
+        messages.show(after_stop(job), "INFO", "objectgs.retry_job", "Continue", number=job.number)
     # One that was stopped while it waited has changed nothing.
     has_changed = job.exit_code is not None and job.kind in ("train", "label", "mesh")
     if job.state is State.DONE or (job.state is State.STOPPED and has_changed):
@@ -326,7 +328,7 @@ def finish(job: Job) -> None:
 
 def _go_on(job: Job, owner: bpy.types.Scene | None) -> None:
     """Run the job again that lacked the packages which a job has installed."""
-    failed = failed_job(_then.pop(job, 0))
+    failed = ended_job(_then.pop(job, 0))
     if failed is None or owner is None:
         messages.show(job.message)
     else:

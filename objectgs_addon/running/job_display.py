@@ -23,6 +23,9 @@ _BUTTON = 45.0
 _WARNINGS = 2
 """Number of warnings of a running job that are drawn, the latest ones."""
 
+_ROWS, _ROWS_BRIEF = 3, 2
+"""Number of rows that the step of a running job takes, and without its step, in a sidebar as wide as Blender's own."""
+
 _AFTER_STOP = {
     "train": " Resume continues it.",
     "mesh": " Extract Meshes continues it.",
@@ -72,7 +75,7 @@ def draw_running(
     row.operator("objectgs.stop_job", text="", icon="X").index = index
     if job.message and job.state is not State.WAITING:
         doing = job.stage if brief else activity(job)
-        write(layout, f"{job.title}: {doing}" if doing else job.title)
+        write(layout, f"{job.title}: {doing}" if doing else job.title, rows=_ROWS_BRIEF if brief else _ROWS)
     if not brief:
         _draw_warnings(layout, job.warnings[-_WARNINGS:])
 

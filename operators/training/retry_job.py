@@ -15,10 +15,10 @@ class RetryJob(bpy.types.Operator):
     bl_description = "Run this job again; it continues from what it has saved"
     bl_options = {"INTERNAL"}
 
-    number: IntProperty(name="Job", description="Number of the failed job", options={"SKIP_SAVE"})
+    number: IntProperty(name="Job", description="Number of the failed or stopped job", options={"SKIP_SAVE"})
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        job = background.failed_job(self.number)
+        job = background.ended_job(self.number)
         if job is None:
             self.report({"WARNING"}, "This job is no longer in the list")
             return {"CANCELLED"}

@@ -1002,7 +1002,7 @@ def test_damaged_files_raise_only_input_errors(write_capture, name):
     read_capture_model(scene.folder)
 
 
-@pytest.mark.parametrize("within", ["", "images"])
+@pytest.mark.parametrize("within", ["", "images", "robot"])
 def test_photos_alone_are_told_what_they_lack(write_capture, tmp_path, run_command, within):
     scene = write_capture()
     photos = tmp_path / "photos"

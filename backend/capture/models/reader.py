@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -78,6 +79,7 @@ def read_capture_model(folder: Path) -> Model:
         raise InputError(unreadable[0])
     if _is_inside_capture(folder):
         raise InputError(f"{folder} is a part of a capture; choose the folder above, {folder.parent}.")
+    photos = photos or _photos_below(folder)
     if photos:
         raise InputError(
             f"{folder} contains {len(photos)} photos, but not where they were taken; compute that with Import "
@@ -89,6 +91,14 @@ def read_capture_model(folder: Path) -> Model:
         f"{folder / 'sparse' / '0'}, or the cameras as transforms.json, Bundler's .out, Metashape's .xml or "
         "RealityScan's .csv."
     )
+
+
+def _photos_below(folder: Path) -> list[Path]:
+    """Return the images in the folders of a folder, except those of masks; none if it cannot be read."""
+    with contextlib.suppress(OSError):
+        folders = [path for path in folder.iterdir() if path.is_dir() and path.name not in ("images", "masks")]
+        return [path for each in folders for path in _files_in(each) if path.suffix.lower() in IMAGES]
+    return []
 
 
 def _with_names_of_files(model: Model, images: Path) -> Model:

@@ -100,8 +100,9 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
         progress, waits = pointing.state()
         if progress < 1.0:
             layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
-            waiting = "Strokes so far are applied when this is done. Press Tab for the next object."
-            text = waiting if pointing.waiting_strokes(root) else pointing.message()
+            text = pointing.message()
+            if pointing.waiting_strokes(root):
+                text = f"{text}. Strokes so far are applied when this is done."
             write(layout, text, rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)

@@ -33,7 +33,6 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
         layout.use_property_decorate = False
         root = context.scene.objectgs.active
         properties = root.objectgs
-        folder = scene.folder_of(root)
         job = _training_job(root)
         active = background.is_busy(root)
         state = folder_trust.state_of(root)
@@ -52,10 +51,8 @@ class TrainPanel(WithReconstruction, bpy.types.Panel):
             return
         if not active:
             _draw_folder_state(layout, root, job)
-        icon = previews.icon_of(folder, previews.RENDER)
-        if icon:
-            layout.template_icon(icon, scale=12.0)
-            layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
+        elif job is not None:
+            _draw_preview(layout, root)
 
 
 class DetailsPanel(WithReconstruction, bpy.types.Panel):
@@ -81,6 +78,16 @@ class DetailsPanel(WithReconstruction, bpy.types.Panel):
         icon = previews.icon_of(scene.folder_of(root), previews.CURVE)
         if icon:
             layout.template_icon(icon, scale=10.0)
+        if not background.is_busy(root):
+            _draw_preview(layout, root)
+
+
+def _draw_preview(layout: bpy.types.UILayout, root: bpy.types.Collection) -> None:
+    """Draw the latest render of a training, if there is one."""
+    icon = previews.icon_of(scene.folder_of(root), previews.RENDER)
+    if icon:
+        layout.template_icon(icon, scale=12.0)
+        layout.operator("objectgs.show_preview", icon="IMAGE_DATA")
 
 
 def _training_job(root: bpy.types.Collection) -> Job | None:
