@@ -113,7 +113,7 @@ def _import_menu(menu: Any, _context: Any) -> None:
 
 
 def _export_menu(menu: Any, _context: Any) -> None:
-    menu.layout.operator("objectgs.export_splats", text="ObjectGS Splats (.ply, .spz, .splat)")
+    menu.layout.operator("objectgs.export_splats", text="ObjectGS Splats (.ply, .spz, .splat, .glb, .usdc)")
     menu.layout.operator("objectgs.export_meshes", text="ObjectGS Meshes (.glb, .usdc, .obj)")
 
 
