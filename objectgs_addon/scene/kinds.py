@@ -183,6 +183,17 @@ def duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collec
     return found
 
 
+def whole_duplicates_of(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
+    """Return the duplicates of each object whose pivots the user has not deleted.
+
+    Hidden parts of others are left, which Blender's *Delete* cannot select, until the edits are stored.
+    """
+    return {
+        object_id: [copy for copy in copies if part_of(copy, OBJECT_PARENT) is not None]
+        for object_id, copies in duplicates_of(root).items()
+    }
+
+
 def _moved_out(
     root: bpy.types.Collection, kind: str, inside: Iterable[bpy.types.Collection]
 ) -> list[bpy.types.Collection]:

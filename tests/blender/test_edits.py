@@ -1411,6 +1411,25 @@ def test_remove_deletes_selected_duplicates_of_blender_alone(root):
     assert links() == before and not entry(root).removed and entry(root).copies == ()
 
 
+def test_hidden_splats_of_a_deleted_duplicate_are_not_shown(root, tmp_path):
+    """Blender's Delete leaves what is hidden."""
+    blender_scene.show_kinds(root, "meshes")
+    activate(root, 1)
+    bpy.ops.objectgs.duplicate_object()
+    (copy,) = blender_scene.duplicates_of(root)[1]
+    bpy.ops.object.select_all(action="DESELECT")
+    for obj in copy.objects:
+        if not obj.hide_viewport:
+            obj.select_set(True)
+    bpy.ops.object.delete()
+    left = [obj for obj in copy.objects if kinds.kind_of(obj) == kinds.SPLATS]
+    for which in ("splats", "both", "meshes"):
+        blender_scene.show_kinds(root, which)
+        assert [obj.hide_viewport and obj.hide_render for obj in left] == [True]
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "some.blend"))
+    assert not blender_scene.duplicates_of(active()) and entry(active()).copies == ()
+
+
 def test_undo_steps_look_only_at_what_is_of_the_extension(root):
     """Scenes may have tens of thousands of other objects."""
     before = undo._links()

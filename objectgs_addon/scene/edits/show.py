@@ -19,7 +19,7 @@ from ....backend.shared.reconstruction.folder import Reconstruction
 from ....backend.shared.reconstruction.objects import SceneObject, edit_objects, is_singular, read_objects
 from .. import carrier
 from ..capture import origin_of
-from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of
+from ..kinds import OBJECT_PARENT, SPLATS, duplicates_of, folder_of, object_collections, part_of, whole_duplicates_of
 from ..object_display import Objects
 from .duplicates import DUPLICATES, adopt_blender_duplicates, bring_up_to_date, duplicate, remove_duplicate
 from .fills import show_fills
@@ -97,7 +97,7 @@ Places = tuple[list | None, list]
 
 def places_of(root: bpy.types.Collection) -> dict[int, Places]:
     """Return where the objects of a reconstruction are now, by ID."""
-    copies = _whole_duplicates(root)
+    copies = whole_duplicates_of(root)
     return {
         object_id: (_place(root, collection), [_place(root, copy) or _IDENTITY for copy in copies.get(object_id, ())])
         for object_id, collection in object_collections(root).items()
@@ -114,14 +114,6 @@ def shows_places(root: bpy.types.Collection, entries: Iterable[SceneObject]) -> 
         for entry in entries
         if entry.id in collections
     )
-
-
-def _whole_duplicates(root: bpy.types.Collection) -> dict[int, list[bpy.types.Collection]]:
-    """Return the duplicates of each object whose pivots the user has not deleted."""
-    return {
-        object_id: [copy for copy in copies if part_of(copy, OBJECT_PARENT) is not None]
-        for object_id, copies in duplicates_of(root).items()
-    }
 
 
 def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | None = None) -> None:
@@ -149,7 +141,7 @@ def store_placements(root: bpy.types.Collection, before: Mapping[int, Places] | 
             for copy in [copy for copy in twins if part_of(copy, OBJECT_PARENT) is None]:
                 remove_duplicate(copy)  # The user deleted its pivot.
         bring_up_to_date(root)
-    copies, collections = _whole_duplicates(root), object_collections(root)
+    copies, collections = whole_duplicates_of(root), object_collections(root)
     now = places_of(root)
     # What is scaled to nothing, as at the beginning of an animation, keeps its place in the file.
     now = {object_id: places for object_id, places in now.items() if not _is_flat(places)}

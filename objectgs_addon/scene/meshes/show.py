@@ -25,12 +25,12 @@ from ..kinds import (
     MESH,
     MESH_KEY,
     SPLATS,
-    duplicates_of,
     folder_of,
     kind_of,
     object_collections,
     object_id_of,
     parts_of,
+    whole_duplicates_of,
 )
 from ..object_collection import remove, remove_if_empty
 from ..object_display import Objects
@@ -169,7 +169,7 @@ def show_kinds(root: bpy.types.Collection, which: str) -> None:
 def apply_shown(root: bpy.types.Collection, changed: Iterable[int | None]) -> None:
     """Apply the choice of `show_kinds` to the collections of object IDs whose parts were added or removed."""
     wanted = set(changed)
-    which, collections, copies = shown_kinds(root), object_collections(root), duplicates_of(root)
+    which, collections, copies = shown_kinds(root), object_collections(root), whole_duplicates_of(root)
     meshes, whole = object_meshes(root), scene_meshes(root)
     hidden = {} if meshes else {obj: which == "splats" for obj in whole}
     for object_id, collection in collections.items():
