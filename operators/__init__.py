@@ -109,7 +109,7 @@ def _classes() -> list[type]:
 def _import_menu(menu: Any, _context: Any) -> None:
     menu.layout.operator("objectgs.import_photos", text="ObjectGS Photos or Video")
     menu.layout.operator("objectgs.import_capture", text="ObjectGS Capture (COLMAP and others)")
-    menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply, .spz, .splat)")
+    menu.layout.operator("objectgs.import_splats", text="3D Gaussian Splats (.ply, .spz, .splat, .glb, .usd)")
 
 
 def _export_menu(menu: Any, _context: Any) -> None:

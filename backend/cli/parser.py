@@ -397,7 +397,7 @@ def _add_import_splats(commands: _Commands) -> None:
     )  # fmt: skip
     import_splats.add_argument(
         "splats", type=Path, metavar="SPLATS",
-        help="file in the format of 3D Gaussian splatting (.ply), or .spz or .splat",
+        help="file in the format of 3D Gaussian splatting (.ply), or .spz, .splat, .glb or .usd",
     )  # fmt: skip
     options.add_output(import_splats)
     import_splats.add_argument("--capture", type=Path, metavar="CAPTURE", help=options.CAPTURE)

@@ -208,9 +208,10 @@ with each object apart.
 """
 
 IMPORT_SPLATS = """\
-Make a reconstruction from splats that another program trained: PLY, SPZ or .splat.
-Their objects are taken from object_id in the PLY or, with --capture, from a vote by
-that capture's masks; the splats must be in its coordinates.
+Make a reconstruction from splats that another program trained: PLY, SPZ, .splat, glTF
+(.glb) or USD. Their objects are taken from object_id in the PLY, from the nodes of glTF
+and USD or, with --capture, from a vote by that capture's masks; the splats must be in
+its coordinates.
 """
 
 DOCTOR = """\

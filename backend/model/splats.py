@@ -117,6 +117,23 @@ def concatenate(parts: Sequence[Splats]) -> Splats:
     )
 
 
+@dataclass(frozen=True)
+class PlacedSplats:
+    """Splats in a space of their own, as nodes of a scene have.
+
+    Attributes:
+        splats: in that space.
+        matrix: (4, 4) affine map to world space.
+        name: of the node, may be empty.
+        object_id: of the object, 0 .. 2^32 - 1, or None if the file does not tell.
+    """
+
+    splats: Splats
+    matrix: NDArray
+    name: str = ""
+    object_id: int | None = None
+
+
 def objects_of(splats: Splats) -> list[tuple[int, Splats, NDArray[np.float64]]]:
     """Return the ID, the splats and the center (3,) of their means' bounds of each object that has splats, by ID."""
     ids, counts = np.unique(splats.object_ids, return_counts=True)

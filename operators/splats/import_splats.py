@@ -28,7 +28,7 @@ class ImportSplats(ImportDialog, bpy.types.Operator):
     bl_options = {"REGISTER"}
 
     filepath: StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
-    filter_glob: StringProperty(default="*.ply;*.spz;*.splat", options={"HIDDEN"})
+    filter_glob: StringProperty(default="*.ply;*.spz;*.splat;*.glb;*.usd;*.usda;*.usdc;*.usdz", options={"HIDDEN"})
     # Plain strings: the button of a DIR_PATH cannot open a second file browser.
     capture: StringProperty(
         name="Capture",

@@ -542,7 +542,7 @@ def test_gltf_and_usd_are_exact_far_from_the_origin(tmp_path):
 def test_usd_needs_its_package(run_command, folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     result = run_command("export", folder.folder, "--out", tmp_path / "all.usdc")
-    assert_rejected(result, "all.usdc", "lacks the package usd-core")
+    assert_rejected(result, "all.usdc", "needs the package usd-core")
     assert not (tmp_path / "all.usdc").exists()
 
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from ...capture import Capture, Points
 from ...editing import transformed
-from ...export import DOWN_TO_UP, read_foreign_splats, write_splats
+from ...export import read_foreign_scene, write_splats
 from ...labels import Votes
 from ...labels import vote as vote_points
 from ...labels.points import write_points
 from ...labels.voting import find_visible_points
+from ...model.splats import concatenate
 from ...shared.errors import InputError
 from ...shared.events import Reporter
-from ...shared.formats.splat_ply import read_description
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.record import ExportRecord, ImportRecord, read_record, update_record
 from ...shared.stopping import StoppingReporter
@@ -42,12 +42,14 @@ def import_splats(options: argparse.Namespace, reporter: StoppingReporter) -> No
         parts = {"splats": parts["splats"], "write": parts["write"]}
     reporter.expect(parts)
     reporter.begin("splats", f"Reading {options.splats.name}")
-    splats, warnings = read_foreign_splats(options.splats)
-    description = read_description(options.splats)
+    nodes, warnings, description = read_foreign_scene(options.splats)
+    placed = [
+        node.splats if np.array_equal(node.matrix, np.eye(4)) else transformed(node.splats, node.matrix)
+        for node in nodes
+    ]
+    splats = placed[0] if len(placed) == 1 else concatenate(placed)
     if len(splats) == 0:
         raise InputError(" ".join([f"{options.splats} contains no splats.", *warnings]))
-    if options.splats.suffix.lower() == ".spz":
-        splats = transformed(splats, DOWN_TO_UP)
     for sentence in warnings:
         reporter.warning(sentence)
     names: Mapping[int, str] = description.names
