@@ -15,7 +15,7 @@ from typing import Any
 from ...backend.shared.console import ConsoleReporter
 from ...backend.shared.errors import EXIT_BAD_INPUT, EXIT_CANCELLED, EXIT_DONE, EXIT_FAILED, Cancelled, InputError
 from ...backend.shared.events import JsonReporter, Reporter
-from . import batch, commands, filming
+from . import batch, commands, filming, meshes
 from .arguments import UsageError, parse
 
 COMMANDS = {
@@ -27,6 +27,7 @@ COMMANDS = {
     "mesh": commands.on_result,
     "edit": commands.on_result,
     "export": commands.on_result,
+    "export-meshes": meshes.export_meshes,
     "import-splats": commands.import_splats,
     "build": commands.build,
     "render": commands.render,

@@ -65,12 +65,19 @@ edits. OPTIONS are those of `python -m backend edit`, whose --help explains them
     "export": (
         "write the splats for other programs",
         """\
-Write the splats of the reconstruction in DIR, with all edits, as PLY, SPZ or .splat.
+Write the splats of the reconstruction in DIR, with all edits, as PLY, SPZ, .splat, glTF or
+USD; export-meshes writes the meshes.
 OPTIONS are those of `python -m backend export`, whose --help explains them:
 --format F, --objects NAME ..., --per-object, --coordinates blender, --sh-degree N.
 """,
     ),
 }
+
+_EXPORT_MESHES = """\
+Write the meshes of the reconstruction in DIR with their textures and all edits, as glTF,
+USD or OBJ: without removed objects, recolored, moved, and with duplicates. Only the .blend
+has its Set Ground and Set Distance, which are left out.
+"""
 
 _IMPORT_SPLATS = """\
 Make a reconstruction of splats that were trained by another program: SPLATS is a PLY,
@@ -189,6 +196,7 @@ def _parser() -> argparse.ArgumentParser:
                 "--out", type=Path, required=True, metavar="PATH", help="file, or a folder with --per-object"
             )
         _backend_python(sub)
+    _export_meshes(command("export-meshes", "write the meshes for other programs", _EXPORT_MESHES))
     imported = command(
         "import-splats",
         "make a reconstruction of splats of another program",
@@ -257,6 +265,27 @@ def _parser() -> argparse.ArgumentParser:
     _meshes(batch)
     _picture(batch)
     return top
+
+
+def _export_meshes(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("folder", type=Path, metavar="DIR", help="reconstruction folder")
+    sub.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="file.glb, .usdc or .obj; with --per-object, a folder of that name without the suffix",
+    )
+    sub.add_argument(
+        "--objects", action="extend", nargs="+", metavar="OBJECT", help="names or IDs (all that are not removed)"
+    )
+    sub.add_argument("--per-object", action="store_true", help="write one file per object")
+    sub.add_argument(
+        "--coordinates",
+        choices=("blender", "capture"),
+        default="blender",
+        help="blender: as in Blender, in the axes of the format; capture: those of the cameras (blender)",
+    )
 
 
 def _film(sub: argparse.ArgumentParser) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Commands of headless.py, except `film` and `batch`."""
+"""Commands of headless.py, except those with a module of their own."""
 
 from __future__ import annotations
 
@@ -248,6 +248,27 @@ def find_backend(python: str | None) -> None:
         )
 
 
+def show_reconstruction(folder: Path, reporter: Reporter) -> bpy.types.Collection:
+    """Show the reconstruction in `folder` in a new file and return its collection.
+
+    Raises:
+        InputError: `folder` contains no reconstruction, or its files cannot be used.
+    """
+    files = Reconstruction(folder)
+    if not files.cameras.is_file():
+        raise InputError(f"{folder} contains no reconstruction; make one with the import or train command.")
+    _empty_file()
+    with quiet():
+        root = scene.show_capture(bpy.context.scene, folder)
+        warnings = scene.warnings_of(root)
+        if files.splats.exists():
+            warnings += scene.show_result(root, folder).warnings
+            view.hide_capture(root)
+    for warning in warnings:
+        reporter.warning(warning)
+    return root
+
+
 def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
     """Show the reconstruction in `folder` in a new file and save it as `blend`.
 
@@ -257,17 +278,9 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
     Raises:
         InputError: `folder` contains no reconstruction, or the file cannot be written.
     """
-    files = Reconstruction(folder)
-    if not files.cameras.is_file():
-        raise InputError(f"{folder} contains no reconstruction; make one with the import or train command.")
-    _empty_file()
+    root = show_reconstruction(folder, reporter)
     target = bpy.context.scene
     with quiet():
-        root = scene.show_capture(target, folder)
-        warnings = scene.warnings_of(root)
-        if files.splats.exists():
-            warnings += scene.show_result(root, folder).warnings
-            view.hide_capture(root)
         scene.set_up_render(target, root)
         view.hide_relationship_lines()
         view.widen_clipping(root)
@@ -277,8 +290,6 @@ def build_blend(folder: Path, blend: Path, reporter: Reporter) -> bool:
         # Cycles works on every machine; EEVEE requires a display.
         target.render.engine = "CYCLES"
         target.cycles.samples = SAMPLES
-    for warning in warnings:
-        reporter.warning(warning)
     folder_trust.store_relative(root, str(blend))
     save_blend(blend, reporter)
     if blend.parent == folder:

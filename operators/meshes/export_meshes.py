@@ -54,24 +54,9 @@ class ExportMeshes(ExportDialog, bpy.types.Operator):
         out, ids = self.choices(context)
         root = need.active_root(context)
         files = mesh_export.export(root, out, self.format, ids, self.per_object, self.coordinates == "capture")
-        text = f"Wrote {files[0] if len(files) == 1 else f'{len(files)} files to {out}'}."
-        without = _without_mesh(root, ids) if scene.object_meshes(root) else []
-        if without:
-            text += f" Left out, since they have no mesh: {', '.join(without)}."
+        text = mesh_export.summary(root, out, files, ids)
         self.report({"INFO"}, text)
         messages.show(text)
-
-
-def _without_mesh(root: bpy.types.Collection, ids: list[int] | None) -> list[str]:
-    """Return the names of the objects to export that have no mesh; ids: None for all objects."""
-    meshes = scene.object_meshes(root)
-    return [
-        item.name
-        for item in root.objectgs.objects
-        if (object_id := scene.from_stored(item.object_id)) not in meshes
-        and not (item.removed or item.is_merged)
-        and (ids is None or object_id in ids)
-    ]
 
 
 CLASSES = (ExportMeshes,)

@@ -23,13 +23,14 @@ from objectgs.backend.cli.parser import build_parser
 from objectgs.backend.shared.console import ConsoleReporter
 from objectgs.backend.shared.formats.ply import read_vertices
 from objectgs.backend.shared.reconstruction.lock import locked
+from objectgs.backend.shared.reconstruction.objects import edit_objects
 from objectgs.objectgs_addon.headless import COMMANDS, commands
 from objectgs.objectgs_addon.headless.batch import _Summary, fingerprint
 from objectgs.objectgs_addon.headless.picture import open_blend, write_picture
 
 import headless
 
-from .building import look_at, tetrahedron, write_cameras, write_meshes, write_objects, write_points
+from .building import look_at, tetrahedron, write_cameras, write_folder, write_meshes, write_objects, write_points
 
 SIZE = ("--size", "48x36", "--samples", "1")
 
@@ -104,6 +105,7 @@ def test_help_lists_commands(capsys):
         (("mesh", "--scene"), "DIR must come first: headless.py mesh DIR."),
         (("edit", "--remove", "mug"), "DIR must come first: headless.py edit DIR."),
         (("export", "somewhere"), "--out"),
+        (("export-meshes", "somewhere"), "--out"),
     ],
 )
 def test_invalid_arguments_are_rejected(arguments, words, capsys):
@@ -713,6 +715,59 @@ def test_characters_that_the_output_lacks_are_escaped(tmp_path):
     python.chmod(0o755)
     ran = run("mesh", tmp_path, "--backend-python", python, PYTHONIOENCODING="ascii")
     assert ran.returncode == 0 and "Reading \\u82b1" in ran.output, ran.output + ran.errors
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """A folder with a mug and a can that have meshes, where the can is removed."""
+    folder = write_folder(tmp_path / "made")
+    write_meshes(folder, {"1": tetrahedron(), "2": tetrahedron()})
+    edit_objects(folder / "objects.json", {2: {"removed": True}})
+    yield folder
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+
+
+def names_in(path):
+    """Return the names of the nodes of a GLB file."""
+    content = path.read_bytes()
+    header = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    return [node["name"] for node in header["nodes"]]
+
+
+def test_export_meshes_has_the_edits(edited, tmp_path, capsys):
+    out = tmp_path / "new" / "all.glb"
+    assert headless.main(["export-meshes", str(edited), "--out", str(out)]) == 0
+    assert names_in(out) == ["mug mesh"]
+    assert f"Wrote {out}." in capsys.readouterr().out
+    edit_objects(edited / "objects.json", {2: {"removed": None}})
+    words = ["--per-object", "--objects", "can", "--coordinates", "capture"]
+    assert headless.main(["export-meshes", str(edited), "--out", str(out.with_suffix(".obj")), *words]) == 0
+    assert [path.name for path in out.with_suffix("").glob("*.obj")] == ["can.obj"]
+    lines = (out.with_suffix("") / "can.obj").read_text().splitlines()
+    places = [[float(number) for number in line.split()[1:4]] for line in lines if line.startswith("v ")]
+    assert places == pytest.approx(tetrahedron().vertices, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("out", "words", "message"),
+    [
+        ("all.gltf", [], "name it .glb, .usdc or .obj."),
+        ("all.glb", ["--objects", "nobody"], "no object nobody"),
+        ("all.glb", ["--objects", "can"], "all of them are removed"),
+        ("made/meshes/1.obj", [], "belongs to the reconstruction"),
+    ],
+)
+def test_export_meshes_rejects_invalid_input(edited, tmp_path, capsys, out, words, message):
+    assert headless.main(["export-meshes", str(edited), "--out", str(tmp_path / out), *words]) == 2
+    assert message in capsys.readouterr().err
+    assert headless.main(["export-meshes", str(tmp_path), "--out", str(tmp_path / "all.obj")]) == 2
+    assert "contains no reconstruction" in capsys.readouterr().err
+
+
+def test_export_meshes_tells_that_a_file_cannot_be_written(edited, tmp_path, capsys):
+    (tmp_path / "all.obj").mkdir()
+    assert headless.main(["export-meshes", str(edited), "--out", str(tmp_path / "all.obj")]) == 2
+    assert "all.obj could not be written; check its folder" in capsys.readouterr().err
 
 
 def test_batch_rejects_invalid_arguments(tmp_path):

@@ -21,6 +21,7 @@ from ...blender.quiet import quiet
 from ..edits.axes import AXES, map_to, part_axes
 from ..kinds import parent_of
 from ..object_collection import our_materials
+from ..object_display import Objects
 from .shading import lit
 
 _EXPORTERS = {"glb": (bpy.ops.export_scene, "gltf"), "usdc": (bpy.ops.wm, "usd_export")}
@@ -107,6 +108,23 @@ def export(
         with lit(mesh for _, mesh in parts), _stage(root, parts, in_capture, bakes, prefix):
             _write(path, suffix, in_capture)
     return list(parts_of)
+
+
+def summary(root: bpy.types.Collection, out: Path, files: list[Path], ids: list[int] | None) -> str:
+    """Return the message for the user after `export`, which wrote `files`: what was written, and what was left out."""
+    text = f"Wrote {files[0] if len(files) == 1 else f'{len(files)} files to {out}'}."
+    meshes, objects = scene.object_meshes(root), Objects.read(scene.folder_of(root))
+    without = [
+        entry.name
+        for entry in objects.entries.values()
+        if entry.id not in meshes
+        and objects.shown_as(entry.id) == entry.id
+        and not entry.removed
+        and (ids is None or entry.id in ids)
+    ]
+    if meshes and without:
+        text += f" Left out, since they have no mesh: {', '.join(without)}."
+    return text
 
 
 def _require_near(root: bpy.types.Collection, meshes: list[bpy.types.Object]) -> None:
