@@ -1813,6 +1813,19 @@ def test_hole_is_filled_and_reopened(ground, filled_ground, root):
     assert surface(root) == captured and blender_scene.UNOBSERVED_COUNT not in collection_of(root)
 
 
+def test_export_of_meshes_tells_of_fills(ground, root, tmp_path, told):
+    """Meshes do not have them."""
+    activate(root, 1)
+    bpy.ops.objectgs.remove_object(fill=True)
+    out = str(tmp_path / "all")
+    bpy.ops.objectgs.export_meshes(filepath=out, format="obj")
+    bpy.ops.objectgs.restore_object(object="1")
+    bpy.ops.objectgs.export_meshes(filepath=out, format="obj")
+    first, second = (text for text, _ in told if text.startswith(f"Wrote {out}"))
+    assert first.endswith("Meshes do not show what fills the holes of removed and moved objects; splats do.")
+    assert "holes" not in second
+
+
 def test_hole_of_moved_object_is_filled(ground, root):
     """The fill is that of the removed object, and is taken back as the object returns."""
     blender_scene.show_kinds(root, "splats")

@@ -124,6 +124,14 @@ def summary(root: bpy.types.Collection, out: Path, files: list[Path], ids: list[
     ]
     if meshes and without:
         text += f" Left out, since they have no mesh: {', '.join(without)}."
+    if any(
+        scene.unobserved_splats(part.data).any()
+        for object_id, collection in scene.object_collections(root).items()
+        if not scene.is_removed(collection) and (ids is None or object_id in ids)
+        for part in scene.parts_of(collection)
+        if scene.kind_of(part) == "splats"
+    ):
+        text += " Meshes do not show what fills the holes of removed and moved objects; splats do."
     return text
 
 
