@@ -33,7 +33,7 @@ be used, also since another program uses it, 1 if any failed for another reason.
 """
 
 _TRAIN_OPTIONS = """\
-All other options after CAPTURE are those of the backend's train command:
+All other options after {} are those of the backend's train command:
 --minutes M or --steps N, --max-size PIXELS, --only NAME ..., --keep KEY ... (train --help lists them).
 """
 
@@ -240,11 +240,11 @@ def _parser() -> argparse.ArgumentParser:
         "all steps from a capture to a .blend and images",
         (
             "Train, make meshes, evaluate, make DIR/objectgs.blend and render it: DIR/render.png shows the splats,\n"
-            "DIR/pulled-apart.png the meshes."
+            "DIR/pulled-apart.png the objects' meshes, if there are any."
         ),
         takes="CAPTURE",
         usage="headless.py run CAPTURE --out DIR [OPTIONS]",
-        epilog=_TRAIN_OPTIONS,
+        epilog=_TRAIN_OPTIONS.format("CAPTURE"),
     )
     _backend(run)
     _compute(run)
@@ -257,9 +257,9 @@ def _parser() -> argparse.ArgumentParser:
         _BATCH,
         takes="FOLDER",
         usage="headless.py batch FOLDER --out DIR [OPTIONS]",
-        epilog=_TRAIN_OPTIONS,
+        epilog=_TRAIN_OPTIONS.format("FOLDER"),
     )
-    _backend(batch)
+    _backend(batch, out="folder of all reconstructions and of the summary")
     _compute(batch)
     _groups(batch)
     _meshes(batch)
@@ -340,8 +340,8 @@ def _demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--overwrite", action="store_true", help="replace a demo capture with other settings in OUT")
 
 
-def _backend(sub: argparse.ArgumentParser, out_required: bool = True) -> None:
-    sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help="reconstruction folder")
+def _backend(sub: argparse.ArgumentParser, out_required: bool = True, out: str = "reconstruction folder") -> None:
+    sub.add_argument("--out", type=Path, required=out_required, metavar="DIR", help=out)
     _backend_python(sub)
 
 

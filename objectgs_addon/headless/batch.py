@@ -11,6 +11,7 @@ from collections import Counter
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from ...backend.shared.errors import Cancelled, InputError
 from ...backend.shared.formats.atomic import write_atomic
@@ -26,6 +27,8 @@ from .built import BLEND
 from .commands import PICTURE, StepFailed, absolute, find_backend, path_options, reconstruct, sentence
 
 DONE, BAD_INPUT, FAILED, UNFINISHED = "done", "bad input", "failed", "unfinished"
+NOT_BEGUN = "not begun"
+"""What unfinished captures are for the user until a batch begins with them."""
 
 _CAPTURE_FILES = {".json", ".txt", ".out", ".xml", ".csv", ".ply", ".obj"}
 """Suffixes of files beside images/ that a capture may consist of: labels, held-out views, cameras and points."""
@@ -35,7 +38,7 @@ _LOCK, _PATIENCE = ".batch.lock", 10.0
 
 _NOTHING: dict[str, Any] = {
     "state": UNFINISHED, "psnr": None, "miou": None, "miou_all": None, "zero_is_background": None, "splats": None,
-    "error": None,
+    "error": None, "step": None,
 }  # fmt: skip
 
 
@@ -149,11 +152,17 @@ def _run_one(
     entry.update(_NOTHING, settings=wanted, seconds=earlier)
     summary.update(entry)
     started = time.monotonic()
+
+    def begin(step: str) -> None:
+        entry.update(step=step, seconds=round(earlier + time.monotonic() - started, 1))
+        summary.update(entry)
+
     try:
-        reconstruct(capture, folder, options)
+        reconstruct(capture, folder, options, begin)
         report = read_report(folder)
         entry.update(
             state=DONE,
+            step=None,
             psnr=report.quality["psnr"],
             miou=report.quality["miou"],
             miou_all=report.quality["miou_all"],
@@ -231,28 +240,44 @@ class _Summary:
     def _write(self) -> None:
         entries = [*self.entries, *self.others]
         write_json(self.json, {"captures": entries})
-        heads = ("capture", "state", "seconds", "PSNR", *MIOU_LABELS.values(), "splats", "error")
-        lines = ["| " + " | ".join(heads) + " |", "|---|---|---:|---:|---:|---:|---:|---|"]
+        heads = ("capture", "image", "state", "seconds", "PSNR", *MIOU_LABELS.values(), "splats")
+        lines = ["| " + " | ".join(heads) + " |", "|---|---|---|---:|---:|---:|---:|---:|"]
         for entry in entries:
+            name, is_done = entry["name"], entry["state"] == DONE
             cells = (
-                entry["name"],
-                entry["state"],
+                _link(name, f"{name}/report.md") if is_done else name,
+                _link("image", f"{name}/{PICTURE}") if is_done else "",
+                f"{_state_of(entry)}, in {entry['step']}" if entry["step"] else _state_of(entry),
                 f"{entry['seconds']:.0f}",
                 _figure(entry["psnr"], ".2f"),
                 # Where pixels without a label are gaps in the masks, objects there are no errors.
                 _figure(entry["miou_all"] if entry["zero_is_background"] else None, ".3f"),
                 _figure(entry["miou"], ".3f"),
                 _figure(entry["splats"], "d"),
-                entry["error"] or "",
             )
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        # Sentences would make the table wider than a screen.
+        errors = [f"- {entry['name']}: {entry['error']}" for entry in entries if entry["error"]]
+        lines += ["", *errors] if errors else []
         write_atomic(self.table, (f"{_sentence(entries)}\n\n" + "\n".join(lines) + "\n").encode())
 
 
 def _sentence(entries: list[dict[str, Any]]) -> str:
-    counts = Counter(entry["state"] for entry in entries)
-    parts = [f"{counts[state]} {state}" for state in (DONE, BAD_INPUT, FAILED, UNFINISHED) if counts[state]]
+    counts = Counter(map(_state_of, entries))
+    states = (DONE, BAD_INPUT, FAILED, UNFINISHED, NOT_BEGUN)
+    parts = [f"{counts[state]} {state}" for state in states if counts[state]]
     return f"{len(entries)} captures: {', '.join(parts)}."
+
+
+def _state_of(entry: dict[str, Any]) -> str:
+    """Return an entry's state for the user, who has to know what remains to be done."""
+    is_begun = entry["state"] != UNFINISHED or entry["settings"] is not None
+    return entry["state"] if is_begun else NOT_BEGUN
+
+
+def _link(text: str, path: str) -> str:
+    escaped = text.replace("[", "\\[").replace("]", "\\]")
+    return f"[{escaped}]({quote(path)})"
 
 
 def _figure(value: float | None, form: str) -> str:

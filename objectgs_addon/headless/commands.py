@@ -154,10 +154,20 @@ def run(options: argparse.Namespace) -> None:
     reconstruct(absolute(Path(options.source)), absolute(options.out), options)
 
 
-def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> None:
-    """Create splats, meshes, a report, a .blend and images of `capture` in `folder`; continue an earlier run."""
+def reconstruct(
+    capture: Path, folder: Path, options: argparse.Namespace, begin: Callable[[str], None] = lambda _step: None
+) -> None:
+    """Create splats, meshes, a report, a .blend and images of `capture` in `folder`; continue an earlier run.
+
+    Args:
+        capture: the capture.
+        folder: the reconstruction folder.
+        options: those of `run`.
+        begin: called with the name of each command before it runs.
+    """
     no_meshes = ["--no-meshes"] if options.no_meshes else []
     compute = _compute_options(options)
+    begin("train")
     run_backend(
         options.reporter,
         "train",
@@ -171,13 +181,17 @@ def reconstruct(capture: Path, folder: Path, options: argparse.Namespace) -> Non
         *options.rest,
     )
     for command in ["evaluate"] if options.no_meshes else ["mesh", "evaluate"]:
+        begin(command)
         try:
             run_backend(options.reporter, command, folder, folder, *compute)
         except NothingMade as error:  # Splats without a surface, or without held-out views, are still a valid result.
             options.reporter.warning(str(error))
+    begin("report")
     run_backend(options.reporter, "report", folder, folder, *compute)
+    begin("build")
     blend = blend_to_write(folder, options.reporter)
     has_meshes = build_blend(folder, blend, options.reporter)
+    begin("render")
     render_picture(
         options.reporter,
         blend,

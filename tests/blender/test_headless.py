@@ -557,7 +557,8 @@ def test_batch_continues_after_invalid_capture_and_resumes(capture, backend_pyth
     assert good["splats"] > 0 and good["seconds"] > 0 and 5 < good["psnr"] < 60 and good["error"] is None
     assert str(captures / "bad") in bad["error"]
     table = (out / "batch.md").read_text()
-    assert bad["error"] in table and "| good | done |" in table and "notes" not in table
+    assert bad["error"] in table and "notes" not in table
+    assert "| [good](good/report.md) | [image](good/render.png) | done |" in table
     assert "| mIoU (all) | mIoU (labeled) |" in table and good["miou_all"] <= good["miou"]
     assert (out / "good" / "objectgs.blend").is_file() and size_of(out / "good" / "render.png") == (48, 36)
 
@@ -676,8 +677,35 @@ def test_batch_keeps_results_of_captures_that_another_one_runs(tmp_path):
     assert other.entry("three") == three and other.entry("broken") == broken
     assert list(summary(tmp_path)) == ["one", "two", "three", "broken"]
     table = (tmp_path / "batch.md").read_text()
-    assert table.startswith("4 captures: 2 done, 1 bad input, 1 unfinished.") and "| three | done |" in table
+    assert table.startswith("4 captures: 2 done, 1 bad input, 1 not begun.") and "/render.png) | done |" in table
     assert own.count("done") == 1
+
+
+def test_batch_summary_tells_what_was_begun(tmp_path):
+    own = _Summary(tmp_path, [Path("a [b] | c"), Path("stopped"), Path("broken"), Path("next")])
+    own.update(own.entry("a [b] | c") | {"state": "done", "settings": {}})
+    own.update(own.entry("stopped") | {"settings": {}, "step": "mesh", "error": "Cancelled."})
+    own.update(own.entry("broken") | {"state": "bad input", "step": "train", "error": "A | long sentence."})
+    head, table, errors = (tmp_path / "batch.md").read_text().split("\n\n")
+    assert head == "4 captures: 1 done, 1 bad input, 1 unfinished, 1 not begun."
+    rows = [line.split(" | ")[:3] for line in table.splitlines()[2:]]
+    link = "a%20%5Bb%5D%20%7C%20c"
+    assert table.splitlines()[2].startswith(
+        f"| [a \\[b\\] \\| c]({link}/report.md) | [image]({link}/render.png) | done |"
+    )
+    assert rows[1:] == [
+        ["| stopped", "", "unfinished, in mesh"],
+        ["| broken", "", "bad input, in train"],
+        ["| next", "", "not begun"],
+    ]
+    assert errors == "- stopped: Cancelled.\n- broken: A | long sentence.\n"
+
+
+def test_batch_help_speaks_of_folders(capsys):
+    with pytest.raises(SystemExit):
+        headless.main(["batch", "--help"])
+    text = capsys.readouterr().out
+    assert "after FOLDER" in text and "CAPTURE" not in text and "folder of all reconstructions" in text
 
 
 def test_batch_tells_of_captures_that_another_program_uses(capture, tmp_path, monkeypatch, capsys):
@@ -690,6 +718,7 @@ def test_batch_tells_of_captures_that_another_program_uses(capture, tmp_path, mo
     captured = capsys.readouterr()
     assert "one: Reached." in captured.out and "1 of 1 captures cannot be used." in captured.err
     assert summary(out)["one"]["state"] == "unfinished" and summary(out)["one"]["error"] == "Reached."
+    assert summary(out)["one"]["step"] == "train"
 
 
 @pytest.mark.parametrize(
