@@ -446,7 +446,7 @@ def test_plan_command_reports_decisions_and_writes_only_out(write_capture, tmp_p
     assert result.code == EXIT_DONE and sorted(path.name for path in tmp_path.rglob("*")) == before
     plan = Plan.of(result.events[-1]["plan"])
     assert plan["pyramid"].overridden and plan["surface"].overridden and not plan.does("meshes")
-    assert len([text for text in result.messages("status") if text.startswith(("Done: ", "Left out: "))]) > 5
+    assert len([text for text in result.messages("status") if text.startswith(("Planned: ", "Left out: "))]) > 5
     assert result.messages("status")[-1].startswith("Expected of ")
     assert_rejected(run_command("plan", capture, "--keep", "everything"), "invalid choice: 'everything'")
     assert_rejected(run_command("plan", tmp_path / "none", "--out", out), "does not exist")
@@ -472,7 +472,7 @@ def test_plan_affects_training_evaluation_and_report(write_capture, tmp_path, ru
     assert began.code == EXIT_DONE
     statuses = began.messages("status")
     assert any(text.startswith("Left out: training on 1 view, since") for text in statuses)
-    assert any(text.startswith("Done: reduced images") and "--keep pyramid" in text for text in statuses)
+    assert any(text.startswith("Planned: reduced images") and "--keep pyramid" in text for text in statuses)
     assert any(text.startswith("Expected in ") and "dB below" in text for text in statuses)
     training = json.loads((out / "objectgs.json").read_text())["training"]
     assert Plan.of(training["plan"]) == read_plan(out / "plan.json")

@@ -66,7 +66,7 @@ class Decision:
 
     def sentence(self) -> str:
         """Return the decision and its reason as a sentence for the user."""
-        verdict = {True: "Done", False: "Left out", None: "Decided later"}[self.done]
+        verdict = {True: "Planned", False: "Left out", None: "Decided later"}[self.done]
         return f"{verdict}: {self.what}, since {self.reason}"
 
 
