@@ -83,5 +83,5 @@ def _watch(job: Job, reporter: Reporter, signals: list[int]) -> None:
                 miou_all=job.miou_all, zero_is_background=job.zero_is_background,
             )  # fmt: skip
         time.sleep(0.02)
-    if job.state is not State.FAILED:
+    if job.state is State.STOPPED or "message" in job.result:
         reporter.status(job.message)

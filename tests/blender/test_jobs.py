@@ -570,6 +570,12 @@ def test_run_blocking_reports_every_message(make):
     assert reporter.messages == [*(f"object {n}" for n in range(100)), "Voted."]
 
 
+def test_run_blocking_leaves_the_end_to_its_caller(make):
+    reporter = Recorder()
+    assert run_blocking(make("say('status', message='Voting')\nsay('done')"), reporter) == 0
+    assert reporter.messages == ["Voting"]
+
+
 def test_run_blocking_reports_and_returns_the_exit_code(make):
     reporter = Recorder()
     code = run_blocking(
