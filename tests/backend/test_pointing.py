@@ -767,6 +767,9 @@ def test_label_refuses_foreign_masks_and_strokes_on_nothing(unlabeled, tmp_path,
     result = run_command("label", out, "--strokes", strokes)
     assert result.code == EXIT_BAD_INPUT and "not made of strokes" in result.err
     assert not (scene.folder / "masks" / "strokes.json").exists()
+    (scene.folder / "masks" / "strokes.json").write_text(json.dumps({"reconstruction": str(tmp_path)}))
+    result = run_command("label", out, "--strokes", tmp_path / "none.json")
+    assert result.code == EXIT_BAD_INPUT and "none.json" in result.err and "replaced" not in result.err
 
 
 def test_masks_of_views_become_masks_of_distorted_photos(write_capture, tmp_path, monkeypatch) -> None:

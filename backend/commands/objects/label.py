@@ -76,13 +76,13 @@ def _label_trained(
     """Find the objects, write masks of the photos, and train the objects' borders."""
     capture, device = trained.capture, opened.device
     _require_own_masks(capture)
+    strokes = read_strokes(options.strokes, opened.views.names)
+    segment = segmentation(options, device)
     if (other := _other_owner(capture, trained.folder)) is not None:
         reporter.warning(
             f"{capture.folder / 'masks'} has the masks of another reconstruction's strokes, that in {other}, and is "
             "replaced; to go on with the other one, separate its objects again."
         )
-    strokes = read_strokes(options.strokes, opened.views.names)
-    segment = segmentation(options, device)
     reporter.expect({KERNELS: ("Preparing", kernel_seconds(device)), _TRAIN: ("Training", border_seconds(trained))})
     ensure_kernels(reporter, device)
     forget_vanished(trained.folder.objects)
