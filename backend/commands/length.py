@@ -11,7 +11,14 @@ import torch
 from ..capture import Capture
 from ..shared.durations import Limit
 from ..shared.errors import InputError
-from ..shared.expectation import DEFAULT_SECONDS, NANOSECONDS_A_PIXEL, expectation, expected_psnr, typical_psnr
+from ..shared.expectation import (
+    DEFAULT_SECONDS,
+    NANOSECONDS_A_PIXEL,
+    expectation,
+    expected_psnr,
+    expected_steps,
+    typical_psnr,
+)
 from ..training.budget import LOOKAHEAD, PRESETS, WARM_UP, Budget, TrainingProgress
 
 _SECONDS_A_STEP = 0.02
@@ -66,6 +73,14 @@ def expected_psnr_of(
         return None
     bounds = expected_psnr(typical_psnr(agreement, _pixels(capture)), *_length(budget, capture, device, done))
     return [round(bound, 2) for bound in bounds]
+
+
+def expected_steps_of(budget: Budget, capture: Capture, device: torch.device, done: TrainingProgress) -> int | None:
+    """Return the fewest steps that are expected of a training for a time; None for others, or without an estimate."""
+    steps, seconds, pixels, trained = _length(budget, capture, device, done)
+    if steps is not None or seconds is None or budget.until_converged:
+        return None
+    return expected_steps(seconds, pixels, trained)
 
 
 def _length(

@@ -9,6 +9,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ..shared.expectation import is_far_fewer
 from ..shared.reconstruction.report import MIOU_LABELS, QUALITY, Report
 
 OBJECTS_SHOWN = 40
@@ -101,16 +102,22 @@ def quality_section(report: Report) -> list[str]:
 
 
 def _of_expectation(report: Report) -> str:
-    """Return the sentence that compares the PSNR with what was expected before the training; empty without either."""
+    """Return how PSNR and steps compare with what was expected before the training; empty without an expectation."""
     bounds, found = report.model.get("expected_psnr"), report.quality["psnr_corrected"]
-    if not bounds or found is None:
-        return ""
-    low, high = bounds
-    verdict = "lower than" if found < low else "higher than" if found > high else "as"
-    return (
-        f"Expected before the training, from how well the photos agree: {low:.1f} to {high:.1f} dB with the colors "
-        f"corrected, as on 80% of the captures measured so far. The result is {verdict} expected."
-    )
+    steps, expected, sentences = report.model.get("trained_steps"), report.model.get("expected_steps"), []
+    if bounds and found is not None:
+        low, high = bounds
+        verdict = "lower than" if found < low else "higher than" if found > high else "as"
+        sentences.append(
+            f"Expected before the training, from how well the photos agree: {low:.1f} to {high:.1f} dB with the colors "
+            f"corrected, as on 80% of the captures measured so far. The result is {verdict} expected."
+        )
+    if steps is not None and is_far_fewer(steps, expected):
+        sentences.append(
+            f"Only {steps:,} steps were trained in the time that was given, of {expected:,} or more that were "
+            "expected, perhaps since other programs used the processors; train for more minutes."
+        )
+    return " ".join(sentences)
 
 
 def _of_validation(report: Report) -> str:

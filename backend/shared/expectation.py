@@ -45,6 +45,9 @@ called in Blender."""
 _LOOKS = ((20.0, "rough"), (24.0, "soft"), (28.0, "good"), (33.0, "sharp"), (math.inf, "very sharp"))
 """PSNR in dB, and what a training below it looks like."""
 
+_FAR_FEWER = 0.5
+"""Fraction of the expected steps, below which the computer had too little time for a training."""
+
 _FINAL = "a training until it stops improving (measured on the demo)"
 
 
@@ -84,6 +87,17 @@ def expected_psnr(
     outlook = _outlook(steps, seconds, pixels, trained)
     short = 0.0 if outlook is None else sum(shortfall(math.sqrt(outlook.fewest * outlook.most))) / 2
     return typical - short - PSNR_FIT.margin, typical - short + PSNR_FIT.margin
+
+
+def expected_steps(seconds: float, pixels: float | None, trained: tuple[int, float] = (0, 0.0)) -> int | None:
+    """Return the fewest steps in a time that `expectation` tells, with the same arguments; None if it tells none."""
+    outlook = _outlook(None, seconds, pixels, trained)
+    return None if outlook is None else _rounded(outlook.fewest)
+
+
+def is_far_fewer(steps: int, expected: int | None) -> bool:
+    """Return whether a training had far fewer steps than the `expected_steps` of its time."""
+    return expected is not None and steps < _FAR_FEWER * expected
 
 
 def expectation(

@@ -67,6 +67,20 @@ def test_expectation_is_recorded_and_compared_in_the_report(write_capture, tmp_p
     assert json.loads((out / "report.json").read_text())["model"]["expected_psnr"] == [low, high]
 
 
+def test_far_fewer_steps_than_expected_are_told(write_capture, tmp_path, run_command, monkeypatch):
+    monkeypatch.setattr(expectation, "NANOSECONDS_A_PIXEL", (0.1, 0.1))
+    folder, out = painted(write_capture), tmp_path / "out"
+    trained = run_command("train", folder, "--out", out, "--minutes", 0.01, "--offsets", 2, "--json")
+    (told,) = (text for text in trained.messages("warning") if "steps that were expected in 0.01 minutes" in text)
+    assert trained.code == EXIT_DONE and told.startswith(f"Only {trained.events[-1]['steps']:,} of the ")
+    assert run_command("evaluate", out).code == run_command("report", out).code == EXIT_DONE
+    model = json.loads((out / "report.json").read_text())["model"]
+    said = f"Only {model['trained_steps']:,} steps were trained in the time that was given, of "
+    assert f"{said}{model['expected_steps']:,} or more" in (out / "report.md").read_text(encoding="utf-8")
+    longer = run_command("train", folder, "--out", out, "--steps", model["trained_steps"] + 1, "--offsets", 2, "--json")
+    assert not [text for text in longer.messages("warning") if "expected" in text], "the length is no time"
+
+
 def test_fit_is_found_again_and_its_margin_covers_most_captures():
     rng = np.random.default_rng(1)
     found = {}

@@ -35,6 +35,14 @@ def test_minutes_give_step_range():
     assert expected(None, 80.0, 100_000) == (f"Expected of 400 to 1,600 steps on a CPU: up to 2.0 dB below {FINAL}")
 
 
+def test_fewest_steps_of_a_time_are_those_told():
+    assert expectation.expected_steps(80.0, 100_000) == 400
+    assert expectation.expected_steps(100.0, 100_000, (200, 50.0)) == 400
+    assert expectation.expected_steps(80.0, None) is None, "unknown device"
+    assert [expectation.is_far_fewer(steps, 400) for steps in (27, 199, 200, 400)] == [True, True, False, False]
+    assert not expectation.is_far_fewer(1, None)
+
+
 def test_own_measurements_replace_typical_speed():
     assert expected(None, 100.0, 100_000, (200, 50.0)) == (f"Expected of 400 steps: 1.0 to 2.0 dB below {FINAL}")
     assert "in 1.7 min:" in expected(400, None, 100_000, (200, 50.0))

@@ -78,7 +78,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             "bytes": folder.splats.stat().st_size if folder.splats.exists() else None,
             "trained_steps": progress.step, "trained_seconds": round(progress.seconds, 1),
             "psnr_of_export": export.psnr_of_export if export else None,
-            "expected_psnr": training.expected_psnr,
+            "expected_psnr": training.expected_psnr, "expected_steps": training.expected_steps,
             "skipped_updates": progress.skipped, "skipped_because_of": progress.causes or None,
         },
         quality=evaluation.quality,

@@ -20,7 +20,7 @@ from ...raster import devices
 from ...shared.durations import Limit
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
-from ...shared.expectation import DEFAULT_SECONDS
+from ...shared.expectation import DEFAULT_SECONDS, is_far_fewer
 from ...shared.formats.points_ply import read_points
 from ...shared.reconstruction.checkpoint import PREVIOUS
 from ...shared.reconstruction.folder import Reconstruction
@@ -42,7 +42,7 @@ from ..folder import (
     plan_of,
     recorded_agreement,
 )
-from ..length import budget_of, expected_of, expected_psnr_of, training_seconds
+from ..length import budget_of, expected_of, expected_psnr_of, expected_steps_of, training_seconds
 from ..planning import build_context, change_objects, choices, find_requested_objects, report_plan, settings
 from ..setup.device import choose_device
 from ..setup.kernels import PART as KERNELS
@@ -88,6 +88,7 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
         }
     )  # fmt: skip
     _check_not_imported(Reconstruction(options.out), options)
+    expected_steps = None
     with open_reconstruction(options, reporter) as (output, capture):
         folder = output.folder
         _expect_training(budget, capture, device, TrainingProgress(), reporter)
@@ -104,6 +105,7 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
             agreement = recorded_agreement(folder, capture, options.max_size)
             if agreement is None:
                 agreement = measure_agreement(trainer.scene.capture, reporter.check)
+            expected_steps = expected_steps_of(budget, trainer.scene.capture, device, progress)
             update_record(
                 folder,
                 capture=capture_record(capture, options.max_size, agreement),
@@ -117,6 +119,7 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
                     votes=votes_key(trainer.scene.capture, options.max_size, options.strategy, options.seed),
                     plan=plan.as_list(),
                     expected_psnr=expected_psnr_of(budget, trainer.scene.capture, device, progress, agreement),
+                    expected_steps=expected_steps,
                 ),
             )
             _expect_training(budget, trainer.scene.capture, device, progress, reporter)
@@ -134,6 +137,12 @@ def _train(team: Team, options: argparse.Namespace, device: torch.device, report
         # The moments of the optimizer, and the model that is not shown, take more memory than the export.
         del trainer
         export = export_model(model, scene, folder, reporter)
+    if is_far_fewer(progress.step, expected_steps):
+        reporter.warning(
+            f"Only {progress.step:,} of the {expected_steps:,} or more steps that were expected in "
+            f"{(budget.seconds or 0) / 60:g} minutes were done, perhaps since other programs use the processors; run "
+            "the same command with more --minutes to go on."
+        )
     latest = progress.latest
     reporter.done(
         steps=progress.step, seconds=round(progress.seconds, 1), anchors=len(model.anchors),

@@ -4,7 +4,7 @@
  "capture": {"folder": "/captures/garden", "max_size": 1600, "digest": "0f...", "agreement": 33.1},
  "votes": {"strategy": "majority", "seed": null, "max_size": 1600, "capture": "0f...", "masks": "a1..."},
  "training": {"settings": {...}, "minutes": 5.0, "steps": null, "preset": null, "device": "cpu", "left_out": [],
-              "votes": {...}, "plan": [...], "expected_psnr": [24.1, 31.9]},
+              "votes": {...}, "plan": [...], "expected_psnr": [24.1, 31.9], "expected_steps": 460},
  "export": {"splats": 81000, "anchors": 21000, "psnr_of_export": null},
  "imported": {"file": "/splats/point_cloud.ply", "splats": 81000},
  "stages": [{"name": "train", "seconds": 300.0, "peak_rss_mb": 900.0}]}
@@ -74,6 +74,7 @@ class TrainingRecord:
         plan: the decisions, as in plan.json.
         expected_psnr: bounds in dB of the PSNR on held-out views that was expected before, see `expected_psnr` in
             `backend.shared.expectation`; None without an expectation.
+        expected_steps: the fewest steps in total that were expected of a training for a time; None likewise.
     """
 
     settings: dict[str, Any]
@@ -85,6 +86,7 @@ class TrainingRecord:
     left_out: list[int] = field(default_factory=list)
     plan: list[dict[str, Any]] | None = None
     expected_psnr: list[float] | None = None
+    expected_steps: int | None = None
 
 
 @dataclass(frozen=True)
