@@ -19,6 +19,9 @@ from .files import encode_mask
 RECORD, REPAIRED = "masks.json", "repair.json"
 """Files in masks/ with how they were made of other masks, and with what was changed in them."""
 
+OVERVIEW = "masks.jpg"
+"""File in masks/ with a picture of some of them."""
+
 SAME_IDS = "same_ids"
 """Key in repair.json: whether IDs mean the objects that they meant in the given masks."""
 

@@ -115,8 +115,9 @@ Find the objects of splats without masks: large planes, what stands on them, and
 with concave borders or gaps around them, such as things on a table, the table and the
 walls. Flat things that lie on others, and things that touch smoothly, are not told apart.
 If things are in parts, lower --detail; if several are one, raise it. Writes strokes that
-mark the objects in three photos each, for `label`; they may be changed before. Splats
-that were imported without a capture are looked at through cameras around them.
+mark the objects in three photos each, for `label`; they may be changed before. A picture
+beside them shows the objects. Splats that were imported without a capture are looked at
+through cameras around them.
 """
 
 LABEL = """\

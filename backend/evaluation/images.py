@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ RULE = (214, 214, 218)
 
 CURVE_SIZE = (320, 240)
 CURVE_PAPER, CURVE_INK, CURVE_LINE = (40, 40, 42), (200, 200, 204), (94, 160, 250)
+
+_SHOWN = 12
+"""Largest number of photos in a picture of masks."""
 
 
 def load_font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
@@ -124,8 +128,24 @@ def thumbnail(image: NDArray, longest: int = 256) -> Image.Image:
     return _resized(as_bytes(image), size, Image.Resampling.LANCZOS)
 
 
-def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str], columns: int = 4) -> Image.Image:
-    """Arrange images in rows of `columns`, each below its title, scaled to fit the size of the first one."""
+def contact_sheet(
+    images: Sequence[NDArray | Image.Image],
+    titles: Sequence[str],
+    columns: int = 4,
+    ids: NDArray | None = None,
+    names: Mapping[int, str] | None = None,
+) -> Image.Image:
+    """Arrange images in rows of `columns`, each below its title, scaled to fit the size of the first one.
+
+    Args:
+        images, titles: The images, (h, w, 3), and their titles.
+        columns: Number of images in a row.
+        ids: The object IDs of all pixels, of any shape, for a legend with the palette's colors; None omits it.
+        names: Object ID -> name for the legend.
+
+    Raises:
+        ValueError: There are no images.
+    """
     if not images:
         raise ValueError("a contact sheet needs at least one image")
     converted = [
@@ -137,7 +157,53 @@ def contact_sheet(images: Sequence[NDArray | Image.Image], titles: Sequence[str]
         scale = min(size[0] / image.width, size[1] / image.height)
         fitted = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
         cells.append((title, image.resize(fitted, Image.Resampling.LANCZOS)))
-    return _sheet(cells, min(columns, len(cells)), "", [])
+    legend = [] if ids is None else _legend_entries(ids, None, names)
+    return _sheet(cells, min(columns, len(cells)), "", legend)
+
+
+class MaskSheet:
+    """Collects the masks of photos one by one, of which some are shown.
+
+    Args:
+        count: number of the photos to come.
+
+    Attributes:
+        photos: number of photos so far that show an object.
+        photos_of: the same of each object by its ID.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._every, self._added = max(count // _SHOWN, 1), 0
+        self._cells: list[tuple[str, NDArray]] = []
+        self._ids: list[NDArray] = []
+        self.photos = 0
+        self.photos_of: Counter[int] = Counter()
+
+    def add(self, title: str, mask: NDArray, photo: Callable[[], NDArray]) -> None:
+        """Add the mask (h, w) of a photo, 0 for no object; `photo` returns its pixels (H, W, 3) if it is shown."""
+        present = np.unique(mask[mask > 0]).tolist()
+        self.photos += bool(present)
+        self.photos_of.update(present)
+        if self._added % self._every == 0 and len(self._cells) < _SHOWN:
+            image = np.asarray(thumbnail(photo(), PANEL_WIDTH), np.float64)
+            rows, columns = (np.linspace(0, old - 1, new).astype(int) for old, new in zip(mask.shape, image.shape))
+            ids = mask[np.ix_(rows, columns)]
+            mixed = np.where((ids > 0)[..., None], 0.45 * image + 0.55 * id_image(ids), image)
+            self._cells.append((title, mixed.astype(np.uint8)))
+            self._ids.append(ids[ids > 0])
+        self._added += 1
+
+    def summary(self, of: str = "photos") -> str:
+        """Return how many objects there are, and in how many photos, or other views that `of` names, of all."""
+        count = len(self.photos_of)
+        return f"{count:,} object{'' if count == 1 else 's'} in {self.photos} of {self._added} {of}"
+
+    def save(self, path: Path, names: Mapping[int, str]) -> None:
+        """Write the picture as a JPEG, with the names of the objects by ID."""
+        titles, images = zip(*self._cells, strict=True)
+        buffer = io.BytesIO()
+        contact_sheet(images, titles, ids=np.concatenate(self._ids), names=names).save(buffer, "JPEG", quality=88)
+        write_atomic(path, buffer.getvalue())
 
 
 def save_image(image: Image.Image, path: Path, limit: int = 300_000, quick: bool = False) -> Path:

@@ -86,7 +86,7 @@ class Pointer:
         used = views.used
         self._graph: SplatGraph = build_graph(
             splats, primitive, [views.camera(index) for index in used],
-            lambda number: self._picture(used[number]), weights, progress,
+            lambda number: self.picture(used[number]), weights, progress,
         )  # fmt: skip
         self._shown: dict[_Drawn, _Shown] = {}
         self._latest: Solution | None = None
@@ -130,12 +130,19 @@ class Pointer:
         self._latest = self._graph.solve(seeds, strokes.everything, self._latest)
         return self._latest.ids // PARTS
 
-    def propose(self, detail: float, progress: Callable[[int, int], object]) -> Strokes:
+    def propose(
+        self,
+        detail: float,
+        progress: Callable[[int, int], object],
+        found_in: Callable[[int, np.ndarray], object] | None = None,
+    ) -> Strokes:
         """Find the objects without strokes, and return strokes that mark them, in up to three photos each.
 
         Args:
             detail: as for `find_objects`. After the first call, others are answered sooner.
             progress: receives the number of finished trials, and of all.
+            found_in: receives the index of each view that objects are looked for in, and their IDs (h, w) in it, in the
+                size of `voting_mask`; those without a stroke have none.
         """
         if self._regions is None:
             self._regions = try_regions(self._graph, progress)
@@ -144,7 +151,9 @@ class Pointer:
         used = self._views.used
         places = np.unique(np.linspace(0, len(used) - 1, min(len(used), _PHOTOS)).round().astype(int))
         best: dict[int, list[tuple[int, Stroke]]] = {}
+        masks: list[tuple[int, np.ndarray]] = []
         for index, shown in self.shown_ids(found, [used[place] for place in places.tolist()]):
+            masks.append((index, shown))
             view = self._views.reference(index)
             for object_id, pixels in zip(*np.unique(shown[shown > 0], return_counts=True), strict=True):
                 if pixels >= _FEWEST_PIXELS:
@@ -155,6 +164,9 @@ class Pointer:
             for object_id in sorted(best)
             for _, stroke in sorted(best[object_id], key=lambda each: -each[0])[:_STROKES]
         )
+        if found_in is not None:
+            for index, shown in masks:
+                found_in(index, np.where(np.isin(shown, list(best)), shown, 0))
         seen, known = self._graph.seen, np.isin(found[self._graph.nodes], list(best))
         everything = bool(seen[known].sum() >= _EVERYTHING * seen.sum())
         return Strokes(strokes, {object_id: default_name(object_id) for object_id in best}, everything)
@@ -223,7 +235,7 @@ class Pointer:
                 row, column = np.nonzero(found >= 0)
                 shown[row, column, np.searchsorted(present, found[row, column])] += part[row, column]
             shown[..., 0] += 1.0 - shown.sum(2)
-            yield index, objects[present[follow_edges(self._picture(index), shown)]]
+            yield index, objects[present[follow_edges(self.picture(index), shown)]]
 
     def _others(self, stroke: Stroke, strokes: Sequence[Stroke]) -> tuple[Stroke, ...]:
         """Return the strokes on other objects from the same viewpoint, if they matter for what a stroke stands for."""
@@ -246,9 +258,9 @@ class Pointer:
 
     def _seen(self, stroke: Stroke, camera: Camera) -> np.ndarray:
         """Return what the user saw while drawing a stroke, (H, W, 3) uint8: the photo, or the splats."""
-        return self._picture(self._index_of[stroke.view]) if isinstance(stroke.view, str) else self._drawn(camera)
+        return self.picture(self._index_of[stroke.view]) if isinstance(stroke.view, str) else self._drawn(camera)
 
-    def _picture(self, index: int) -> np.ndarray:
+    def picture(self, index: int) -> np.ndarray:
         """Return the picture (H, W, 3) uint8 of a view: its photo, or else the splats."""
         return self._drawn(self._views.camera(index)) if self._views.photo is None else self._views.photo(index)
 

@@ -268,6 +268,10 @@ def test_label_separates_the_objects_that_are_clicked(unlabeled, tmp_path, run_c
     assert "Stroke 1 shows no splats" in warnings and f"that in {tmp_path}, and is replaced" in warnings
     assert json.loads(beside.read_text()) == {**content, "reconstruction": str(out.resolve())}
     assert json.loads((scene.folder / "labels.json").read_text())["1"] == "ball"
+    said = result.messages("status")
+    assert any(text.startswith("Masks show 3 objects in ") and "masks.jpg" in text for text in said)
+    assert any(text.startswith("ball: in ") for text in said)
+    assert Image.open(scene.folder / "masks" / "masks.jpg").format == "JPEG"
     assert result.events[-1]["steps"] == 180, "a fifth more than before"
     capture = load_capture(scene.folder, tmp_path / "again")
     assert capture.has_masks and all(capture.views[i].mask_file is None for i in capture.test_indices)
@@ -740,6 +744,10 @@ def test_proposed_objects_are_separated_by_label(unlabeled, tmp_path, run_comman
     scene, out = unlabeled
     result = run_command("propose", out, "--json")
     assert result.code == EXIT_DONE and result.events[-1]["objects"] >= 3
+    assert any(
+        text.startswith(f"Found {result.events[-1]['objects']} objects in ") for text in result.messages("status")
+    )
+    assert Image.open(result.events[-1]["picture"]).format == "JPEG" and (out / "strokes.jpg").exists()
     content = json.loads((out / "strokes.json").read_text())
     assert {stroke["view"] for stroke in content["strokes"]} <= set(scene.names)
     assert all(stroke["exact"] for stroke in content["strokes"])

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from backend.evaluation import comparison, contact_sheet, id_image, save_image, write_report
-from backend.evaluation.images import load_font, shorten
+from backend.evaluation.images import MaskSheet, load_font, shorten
 from backend.evaluation.report_plots import plot_curve, plot_objects
 from backend.evaluation.report_text import duration
 from backend.shared.color.palette import UNLABELED, colors_of, object_colors, to_linear
@@ -375,6 +375,21 @@ def test_contact_sheet_shows_all_images():
         assert found.get((40 * i,) * 3, 0) >= 30 * 40
     with pytest.raises(ValueError, match="at least one"):
         contact_sheet([], [])
+
+
+def test_mask_sheet_counts_photos_and_names_its_colors(tmp_path):
+    sheet = MaskSheet(30)
+    for number in range(30):
+        ids = np.zeros((60, 80), np.int64)
+        ids[:20] = 7 if number < 20 else 0
+        ids[40:] = 9 if number < 10 else 0
+        sheet.add(f"{number}.png", ids, lambda: np.zeros((120, 160, 3), np.uint8))
+    assert sheet.summary() == "2 objects in 20 of 30 photos" and sheet.photos_of == {7: 20, 9: 10}
+    sheet.save(tmp_path / "named.jpg", {7: "mug"})
+    sheet.save(tmp_path / "other.jpg", {7: "a longer name"})
+    named, other = (np.asarray(Image.open(tmp_path / name), np.int64) for name in ("named.jpg", "other.jpg"))
+    changed = np.flatnonzero((abs(named - other) > 30).any((1, 2)))
+    assert len(changed) and changed.min() > 0.8 * len(named), "the legend alone has the names"
 
 
 def test_saved_images_are_small(tmp_path):

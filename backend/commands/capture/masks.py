@@ -20,6 +20,7 @@ import numpy as np
 from ...capture.colmap import Model
 from ...capture.files import Files, image_size, read_image, same_shape
 from ...capture.made_masks import (
+    OVERVIEW,
     RECORD,
     is_made,
     is_made_of_others,
@@ -31,8 +32,7 @@ from ...capture.made_masks import (
 from ...capture.mask_sources import MaskSource, Segments, open_source
 from ...capture.models import Photos, read_capture_model, with_observations
 from ...capture.names import read_names
-from ...evaluation import contact_sheet
-from ...evaluation.images import id_image, thumbnail
+from ...evaluation.images import MaskSheet
 from ...labels.association import Association, Seen, associate, consistency, object_mask
 from ...segmentation import chosen_checkpoint, is_checkpoint
 from ...shared.class_table import LARGEST_ID
@@ -42,9 +42,6 @@ from ...shared.stopping import StoppingReporter
 from ..folder import READ
 from .former_masks import FormerMasks, read_former
 from .segmented import require_fitting_options, segmented
-
-OVERVIEW = "masks.jpg"
-"""File in masks/ with a picture of some of them."""
 
 _GIVEN_LABELS = "labels-given.json"
 """File of the capture with the names that its labels.json had before the first masks were made here."""
@@ -56,7 +53,6 @@ _POINTS = 20_000
 _CONSISTENT = 0.6
 """IDs that agree on a smaller part of the points are not taken for those of objects."""
 
-_PICTURES = 12
 _LISTED = 10
 """Largest number of IDs in a warning."""
 
@@ -355,14 +351,11 @@ def _write(
     if is_kept:
         record["source"] = str(kept_masks(capture).resolve())
     with new_masks(capture, kept_masks(capture) if is_kept else None) as folder:
-        pictures: list[tuple[str, np.ndarray]] = []
-        every = max(len(found.ids) // _PICTURES, 1)
-        for number, (name, mask) in enumerate(drawn):
+        sheet = MaskSheet(len(found.ids))
+        for name, mask in drawn:
             write_mask(folder, name, mask)
-            if number % every == 0 and len(pictures) < _PICTURES:
-                pictures.append((name, _overlay(photos / name, mask)))
-        sheet = contact_sheet([image for _, image in pictures], [name for name, _ in pictures])
-        sheet.save(folder / OVERVIEW, quality=88)
+            sheet.add(name, mask, lambda photo=photos / name: np.asarray(read_image(photo)))  # type: ignore[misc]
+        sheet.save(folder / OVERVIEW, found.names)
         write_json(folder / RECORD, record)
     if not was_made:
         # Beside the given masks, the names are those of their IDs, also where labels.json has later ones.
@@ -378,15 +371,6 @@ def _keep_labels(labels: Path, kept: Path, found: _Found) -> None:
             return
     if labels.is_file() and not kept.exists():
         shutil.copyfile(labels, kept)
-
-
-def _overlay(photo: Path, mask: np.ndarray) -> np.ndarray:
-    """Return a photo with the colors of its objects over it."""
-    image = np.asarray(thumbnail(np.asarray(read_image(photo)), 480), np.float64)
-    rows, columns = (np.linspace(0, size - 1, wanted).astype(int) for size, wanted in zip(mask.shape, image.shape))
-    ids = mask[np.ix_(rows, columns)]
-    mixed = np.where((ids > 0)[..., None], 0.45 * image + 0.55 * id_image(ids), image)
-    return mixed.astype(np.uint8)
 
 
 def _report(record: dict[str, Any], reporter: StoppingReporter) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ...capture import Capture, load_capture
-from ...capture.made_masks import new_masks, write_mask
+from ...capture.made_masks import OVERVIEW, new_masks, write_mask
+from ...evaluation.images import MaskSheet
 from ...model.splats import Splats
 from ...planning.decisions import Choices, decide, planned_capture, planned_settings
 from ...pointing.pointer import Pointer
@@ -98,6 +100,7 @@ def _label_trained(
     reporter.done(
         masks=str(capture.folder / "masks"), objects=_number_of(strokes), views=len(capture.train_indices),
         splats=str(trained.folder.splats), steps=trainer.progress.step,
+        picture=str(capture.folder / "masks" / OVERVIEW),
     )  # fmt: skip
 
 
@@ -113,6 +116,8 @@ def _label_plain(opened: Pointable, splats: Splats, options: argparse.Namespace,
         ids = _solve(opened.pointer(reporter.progress, segment), strokes, reporter)
     reporter.begin(EXPORT, f"Writing {opened.folder.splats.name}")
     write_labeled(opened.folder, splats, ids, strokes.names, reporter)
+    for i, count in zip(*(each.tolist() for each in np.unique(ids[ids > 0], return_counts=True)), strict=True):
+        reporter.status(f"{strokes.names.get(i) or default_name(i)}: {count:,} splats")
     reporter.done(objects=_number_of(strokes), splats=str(opened.folder.splats))
 
 
@@ -152,15 +157,24 @@ def _write_masks(
     options: argparse.Namespace,
     reporter: StoppingReporter,
 ) -> None:
-    """Write masks of the training photos, which replace those of earlier strokes when complete, and labels.json."""
+    """Write masks of the training photos, which replace those of earlier strokes when complete, and labels.json.
+
+    A picture of some of them is beside them.
+    """
     capture, owner = trained.capture, str(trained.folder.folder.resolve())
+    names = {i: strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
+    sheet = MaskSheet(len(capture.train_indices))
     with new_masks(capture.folder) as folder:
         for done, (index, mask) in enumerate(pointer.masks(ids), 1):
             write_mask(folder, capture.views[index].name, capture.photo_mask(index, mask))
+            sheet.add(capture.views[index].name, mask, partial(capture.image, index))
             reporter.progress(done, len(capture.train_indices), what="photos")
+        sheet.save(folder / OVERVIEW, names)
         write_json(folder / STROKES, {**read_json(options.strokes), _OWNER: owner})
-    names = {str(i): strokes.names.get(i) or default_name(i) for i in np.unique(ids).tolist() if i}
-    write_json(capture.folder / "labels.json", names)
+    write_json(capture.folder / "labels.json", {str(i): name for i, name in names.items()})
+    reporter.status(f"Masks show {sheet.summary()}; see {capture.folder / 'masks' / OVERVIEW}")
+    for i, name in names.items():
+        reporter.status(f"{name}: in {sheet.photos_of[i]} photos")
 
 
 def begin_border_training(

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
+import numpy as np
+
+from ...evaluation.images import MaskSheet
 from ...pointing.strokes import content_of
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
@@ -29,11 +33,21 @@ def propose(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")
     pointer = opened.pointer(reporter.progress)
     reporter.begin(_DRAW, "Finding objects")
-    found = pointer.propose(options.detail, reporter.progress)
+    masks: dict[int, np.ndarray] = {}
+    found = pointer.propose(options.detail, reporter.progress, masks.__setitem__)
     if not found.strokes:
         raise InputError(
             f"No objects were found in {opened.folder.folder}; try another --detail, or mark them by strokes."
         )
     path = options.strokes or opened.folder.strokes
+    sheet, picture = MaskSheet(len(masks)), path.with_suffix(".jpg")
+    for index, mask in masks.items():
+        title = opened.views.names[index] if opened.views.names else f"view {index + 1}"
+        sheet.add(title, mask, partial(pointer.picture, index))
     write_json(path, content_of(found))
-    reporter.done(objects=len(found.names), strokes=str(path))
+    sheet.save(picture, found.names)
+    reporter.status(
+        f"Found {sheet.summary('photos' if opened.views.names else 'views')}; see {picture}. If things are in parts, "
+        "lower --detail; if several are one, raise it"
+    )
+    reporter.done(objects=len(found.names), strokes=str(path), picture=str(picture))
