@@ -15,7 +15,7 @@ from ..shared.reconstruction.folder import Reconstruction
 from ..shared.reconstruction.report import Report, complete, write_report_json
 from .images import save_image
 from .mesh_sheet import save_sheet
-from .report_plots import plot_curve, plot_objects
+from .report_plots import curve_measures, plot_curve, plot_objects
 from .report_text import (
     choose_objects,
     escape,
@@ -81,7 +81,11 @@ def write_report(
 
     parts = [f"# {escape(title)}", summarize(report), *quality_section(report)]
     if curve_file:
-        parts += ["## Quality over run time", f"![PSNR and mIoU over run time]({link(curve_file)})"]
+        drawn = " and ".join(curve_measures(report.curve, report.zero_is_background).values())
+        parts += [f"## {drawn} over run time", f"![{drawn} of held-out views over run time]({link(curve_file)})"]
+        last, steps = report.curve[-1]["step"], report.model.get("trained_steps")
+        if last is not None and steps is not None and last < steps:
+            parts.append(f"The last measurement was after {last:,} of {steps:,} steps.")
     if files:
         parts.append("## Images")
         parts += [f"**{escape(caption)}**\n\n![{escape(caption)}]({link(path)})" for caption, path in files]

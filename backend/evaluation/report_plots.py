@@ -34,20 +34,28 @@ _STYLE: dict[Any, Any] = {
 }
 
 
+def curve_measures(curve: Sequence[Mapping[str, Any]], zero_is_background: bool = False) -> dict[str, str]:
+    """Return what `plot_curve` draws: the names for the user by the entries' keys; empty if nothing was measured."""
+    lead = lead_miou(curve[-1] if curve else {}, zero_is_background)
+    known = {"psnr": "PSNR", lead: MIOU_LABELS[lead]}
+    return {key: name for key, name in known.items() if any(entry.get(key) is not None for entry in curve)}
+
+
 def plot_curve(curve: Sequence[Mapping[str, Any]], zero_is_background: bool = False) -> Image.Image | None:
     """Plot PSNR and mIoU on held-out views over the run time, one panel each; None if nothing was measured.
 
     The mIoU is `lead_miou` of the latest measurement.
     """
-    lead = lead_miou(curve[-1] if curve else {}, zero_is_background)
     panels = []
-    for key, title, color, how in (
-        ("psnr", "PSNR (dB), higher is better", "#3b7dd8", "{:.2f} dB"),
-        (lead, f"{MIOU_LABELS[lead]}, 1 is perfect", "#d9731a", "{:.3f}"),
-    ):
-        points = [(entry["seconds"], entry[key]) for entry in curve if entry.get(key) is not None]
-        if points:
-            panels.append((title, color, how, points))
+    for key, name in curve_measures(curve, zero_is_background).items():
+        title, color, how = (
+            (f"{name} (dB), higher is better", "#3b7dd8", "{:.2f} dB")
+            if key == "psnr"
+            else (f"{name}, 1 is perfect", "#d9731a", "{:.3f}")
+        )
+        panels.append(
+            (title, color, how, [(entry["seconds"], entry[key]) for entry in curve if entry.get(key) is not None])
+        )
     if not panels:
         return None
     longest = max(point[0] for panel in panels for point in panel[3])

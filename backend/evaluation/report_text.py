@@ -14,6 +14,10 @@ from ..shared.reconstruction.report import MIOU_LABELS, QUALITY, Report
 
 OBJECTS_SHOWN = 40
 
+_OF_OBJECTS = ("miou", "miou_all", "mbiou", "miou_alone", "dice", "accuracy")
+"""The metrics that need masks of held-out photos."""
+_PHOTOS_NAMED = 3
+
 IOU_LABELS = {"iou_all": "IoU (all)", "iou": "IoU (labeled)"}
 """Names of the entries of an object that `MIOU_LABELS` are the means of."""
 
@@ -72,12 +76,15 @@ def summarize(report: Report) -> str:
 
 
 def quality_section(report: Report) -> list[str]:
+    if all(value is None for value in report.quality.values()):
+        return [each for each in ("## Quality", _why_nothing(report), _of_expectation(report)) if each]
     rows = []
     lead = report.lead_miou
+    without = "" if any(report.quality[key] is not None for key in _OF_OBJECTS) else _why_no_objects(report)
     order = [key for key in QUALITY if key not in MIOU_LABELS]
     order[order.index("mbiou") : order.index("mbiou")] = sorted(MIOU_LABELS, key=lambda key: key != lead)
     for key in order:
-        if key == "miou_alone" and report.quality[key] is None:
+        if report.quality[key] is None and (key == "miou_alone" or (without and key in _OF_OBJECTS)):
             continue
         label, unit, meaning = _MEANINGS[key]
         value = report.quality[key]
@@ -85,7 +92,7 @@ def quality_section(report: Report) -> list[str]:
         rows.append((label, f"**{text}**" if value is not None else text, meaning))
     intro = (
         "Measured on the held-out views (every 8th image by file name, or those in test.txt), which were not used for "
-        f"training. {_of_validation(report)}{_of_unlabeled(report)}"
+        f"training. {_of_validation(report)}{without or _of_unlabeled(report)}"
     )
     parts = ["## Quality", intro, table(("", "Value", "Meaning"), rows, right=(1,))]
     if expected := _of_expectation(report):
@@ -99,6 +106,26 @@ def quality_section(report: Report) -> list[str]:
             "in `report.json`."
         )
     return parts
+
+
+def _why_nothing(report: Report) -> str:
+    """Return a sentence on why nothing was measured, and what to do."""
+    if report.capture.get("held_out") == 0:
+        return "Not measured, since no photo is held out; the capture's test.txt can name some."
+    return "Not measured yet; run `evaluate`, and then `report` again."
+
+
+def _why_no_objects(report: Report) -> str:
+    """Return a sentence on why no object was measured, and what to do."""
+    if not report.capture.get("masks"):
+        return "Objects were not measured, since the capture has no masks, which `masks` makes."
+    names = [escape(view["name"]) for view in report.views]
+    shown = names if len(names) <= _PHOTOS_NAMED else [*names[:_PHOTOS_NAMED], f"{len(names) - _PHOTOS_NAMED:,} more"]
+    listed = f"{', '.join(shown[:-1])} and {shown[-1]}" if len(shown) > 1 else "".join(shown)
+    return (
+        "Objects were not measured, since no held-out photo has a mask with an object; those that `label` makes are of "
+        f"training photos alone. Add masks of {listed} with the same IDs, and run `evaluate` and `report` again."
+    )
 
 
 def _of_expectation(report: Report) -> str:
@@ -160,9 +187,13 @@ def choose_objects(objects: list[dict[str, Any]], iou: str = "iou") -> tuple[lis
 
 
 def objects_table(objects: list[dict[str, Any]], swatches: Mapping[int, str], iou: str = "iou") -> str:
-    columns = [(IOU_LABELS[iou], iou, "{:.3f}"), ("Anchors", "anchors", "{:,.0f}")]
-    if any(entry["iou_alone"] is not None for entry in objects):
-        columns.insert(1, ("IoU alone", "iou_alone", "{:.3f}"))
+    columns = [
+        (head, key, how)
+        for head, key, how in (
+            (IOU_LABELS[iou], iou, "{:.3f}"), ("IoU alone", "iou_alone", "{:.3f}"), ("Anchors", "anchors", "{:,.0f}")
+        )
+        if key == "anchors" or any(entry[key] is not None for entry in objects)
+    ]  # fmt: skip
     rows = [
         [f"![]({swatches[entry['id']]})", str(entry["id"]), escape(entry["name"])]
         + [_number(entry[key], how) for _, key, how in columns]

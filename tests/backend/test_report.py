@@ -144,6 +144,29 @@ def test_report_of_earlier_version_has_no_miou_all(reconstruction):
     assert "mIoU (labeled) 0.970" in text and "| mIoU (all) | — |" in text
 
 
+def test_objects_without_masks_of_held_out_photos_are_left_out_with_the_reason(reconstruction):
+    report = a_report()
+    report["quality"] = {"psnr": 28.2, "lpips": None}
+    report["curve"] = [{"seconds": 60.0, "step": 900, "psnr": 30.0, "miou": None}]
+    report["objects"] = [{"id": 1, "name": "mug", "anchors": 100}]
+    report["model"]["trained_steps"] = 1000
+    report["views"] = [{"name": f"{i}.png", "psnr": 28.0, "miou": None} for i in range(5)]
+
+    def text_with(**capture):
+        write_report(reconstruction, Report(**{**report, "capture": capture}))
+        return reconstruction.report_md.read_text(encoding="utf-8")
+
+    text = text_with(masks=7)
+    assert "| LPIPS | — |" in text and "mIoU" not in text and "IoU (" not in text and "| Dice" not in text
+    assert "Add masks of 0.png, 1.png, 2.png and 2 more with the same IDs" in text
+    assert "## PSNR over run time" in text and "![PSNR of held-out views over run time]" in text
+    assert "The last measurement was after 900 of 1,000 steps." in text
+    assert "the capture has no masks" in text_with(masks=0)
+    report["quality"] = {}
+    assert "no photo is held out" in text_with(held_out=0) and "| PSNR |" not in text_with(held_out=2)
+    assert "run `evaluate`" in text_with(held_out=2)
+
+
 def test_empty_report_has_only_null(reconstruction):
     report = write_report(reconstruction, Report()).as_dict()
     assert set(report["quality"].values()) == {None}
