@@ -22,6 +22,8 @@ _WEAK_ERROR = 2.5
 _FEW_POINTS = 40
 _POINTS_SHOWN = 20_000
 _NAMED = 6
+_ALL_NAMED, _LONGEST_NAME = 30, 16
+"""Largest number of photos whose names are all written along the axes, and of characters of such a name."""
 _GOOD, _WEAK = "#3b7dd8", "#d9731a"
 
 
@@ -140,20 +142,33 @@ def _draw_matches(axes, names: Sequence[str], path: Path) -> None:  # type: igno
     shown = axes.imshow(counts, cmap="Blues", vmin=1, vmax=3.2, interpolation="nearest")
     bar = axes.figure.colorbar(shown, ax=axes, shrink=0.8, ticks=[1, 2, 3])
     bar.ax.set_yticklabels(["10", "100", "1,000"])
+    _name_photos(axes.xaxis, names)
+    _name_photos(axes.yaxis, names)
     axes.set_title("Matches between photos, by name")
 
 
 def _draw_errors(axes, figures: Mapping[str, PhotoFigures], weak: Sequence[str]) -> None:  # type: ignore[no-untyped-def]
-    """Draw the reprojection error of each photo, and name the weak ones."""
+    """Draw the reprojection error of each photo, and name all, or the weak ones of many."""
     values = [each.error for each in figures.values()]
     axes.bar(range(len(values)), values, width=1.0, color=[_WEAK if name in weak else _GOOD for name in figures])
-    axes.axhline(float(np.median(values)), color="#26262a", lw=0.8)
+    axes.axhline(float(np.median(values)), color="#26262a", lw=0.8, label="median of the photos")
+    axes.legend(frameon=False, loc="upper right")
     numbers = {name: number for number, name in enumerate(figures)}
     for name in list(weak)[:_NAMED]:
-        if name in numbers:
+        if name in numbers and len(figures) > _ALL_NAMED:
             at = numbers[name]
             axes.annotate(
                 name, (at, values[at]), rotation=30, fontsize=7, ha="left", va="bottom", color=_WEAK, parse_math=False
             )
+    axes.margins(y=0.25)
+    _name_photos(axes.xaxis, list(figures))
     axes.set(xlabel="photo, by name", ylabel="pixels")
-    axes.set_title("Median reprojection error of each photo; weak ones in orange")
+    axes.set_title("Median reprojection error of each photo;\nweak ones in orange")
+
+
+def _name_photos(axis, names: Sequence[str]) -> None:  # type: ignore[no-untyped-def]
+    """Write the names of photos along an axis if they are few enough; there are numbers otherwise."""
+    if len(names) <= _ALL_NAMED:
+        shown = [name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}" for name in names]
+        axis.set_ticks(range(len(names)), shown, parse_math=False, fontsize=6)
+        axis.set_tick_params(rotation=90 if axis.axis_name == "x" else 0)

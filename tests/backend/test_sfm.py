@@ -1,5 +1,6 @@
 """Poses of photos alone: against the exact poses of rendered photos, after stops, and with photos that do not fit."""
 
+import io
 import json
 import shutil
 import sqlite3
@@ -15,6 +16,7 @@ import numpy as np
 import psutil
 import pycolmap
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
@@ -334,6 +336,24 @@ def test_weak_photos_are_those_unlike_the_others():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("count", [14, 40])
+def test_picture_names_few_photos_and_has_whole_titles(count):
+    names = [f"a long folder/DSC_{number:04}.jpg" for number in range(count)]
+    figures = {name: check.PhotoFigures(1.0, 0.5, 900) for name in names}
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    axes = figure.subplots(1, 3, width_ratios=(1.1, 1, 1.2))[2]
+    check._draw_errors(axes, figures, names[:2])
+    figure.savefig(io.BytesIO(), format="png")
+    title = axes.title.get_window_extent()
+    assert title.x0 > 0 and title.x1 <= figure.bbox.x1
+    assert [each.get_text() for each in axes.get_legend().get_texts()] == ["median of the photos"]
+    ticks, named = axes.get_xticklabels(), [each.get_text() for each in axes.texts]
+    assert (
+        [each.get_text()[-12:] for each in ticks] == [name[-12:] for name in names] if count == 14 else len(ticks) < 40
+    )
+    assert named == ([] if count == 14 else names[:2])
+
+
 def test_features_can_be_on_objects_alone(photos, tmp_path, run_command, no_dense_points):
     """Half of each mask is an object, and one photo has no mask; another set of photos has none at all."""
     folder = shutil.copytree(photos, tmp_path / "turntable")
