@@ -23,6 +23,7 @@ from .report_text import (
     meshes_section,
     objects_table,
     quality_section,
+    row_name,
     stages_section,
     summarize,
     table,
@@ -97,7 +98,7 @@ def write_report(
     parts += meshes_section(report, None if mesh_sheet is None else link(sheet_file))
     parts += [*stages_section(report), *left_out_section(report)]
     for name, heading in (("model", "Model"), ("capture", "Capture"), ("settings", "Settings"), ("machine", "Machine")):
-        rows = [(escape(key), value_text(key, value)) for key, value in getattr(report, name).items()]
+        rows = [(row_name(key), value_text(key, value)) for key, value in getattr(report, name).items()]
         if rows:
             parts += [f"## {heading}", table(("", "Value"), rows)]
     parts.append("All values are in `report.json`. A dash (—) marks a value that was not measured or not set.")

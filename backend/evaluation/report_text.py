@@ -56,6 +56,65 @@ _MEANINGS = {
 }
 
 
+_ROWS = {
+    "anchors": "Anchors",
+    "gaussians": "Splats",
+    "bytes": "Size of splats.ply",
+    "trained_steps": "Steps",
+    "trained_seconds": "Time of all training",
+    "psnr_of_export": "PSNR of splats.ply against the model, dB",
+    "expected_psnr": "Expected PSNR, colors corrected, dB",
+    "expected_steps": "Expected steps, at least",
+    "skipped_updates": "Updates that were skipped, since they were not finite",
+    "skipped_because_of": "Causes of these",
+    "folder": "Folder",
+    "views": "Photos that are used",
+    "held_out": "Held-out photos",
+    "validation": "Validation photos",
+    "validation_joined": "Validation photos are trained on at the end",
+    "objects": "Objects in the masks",
+    "registered": "Photos with a pose",
+    "used": "Photos with a pose and a file",
+    "missing": "Photos with a pose, but no file",
+    "unregistered": "Photos without a pose",
+    "masks": "Masks",
+    "points": "Points",
+    "cameras": "Lenses",
+    "exposure_varies": "Exposure varies",
+    "supervise_background": "Pixels without a label are background",
+    "minutes": "`--minutes`",
+    "steps": "`--steps`",
+    "max_size": "`--max-size`, pixels",
+    "strategy": "`--strategy`",
+    "seed": "`--seed`",
+    "mode": "`--mode`",
+    "sh_degree": "`--sh-degree`",
+    "offsets": "`--offsets`",
+    "voxel": "`--voxel`",
+    "max_anchors": "`--max-anchors`",
+    "background": "`--background`",
+    "semantic_weight": "`--semantic-weight`",
+    "ssim_weight": "Weight of SSIM in the loss",
+    "volume_weight": "Weight of the splats' volume in the loss",
+    "zero_is_object": "`--unlabeled-is-object`",
+    "primitive": "`--primitive`",
+    "normal_weight": "`--normal-weight`",
+    "distortion_weight": "`--distortion-weight`",
+    "pyramid": "Begins with reduced photos (—: large ones alone)",
+    "fit_colors": "Fits the colors of each photo",
+    "objectgs": "ObjectGS",
+    "python": "Python",
+    "system": "System",
+    "cores": "Processor cores",
+    "threads": "Threads",
+    "memory_gb": "Memory, GB",
+    "gpu_memory_gb": "Memory of the GPU, GB",
+    "cuda": "CUDA or ROCm",
+    "device": "Trained on",
+}
+"""Names for the user of entries of `model`, `capture`, `settings` and `machine`; others, as packages, have none."""
+
+
 def summarize(report: Report) -> str:
     """Return one sentence with the numbers of objects and splats, the quality and the computing time."""
     quality, model = report.quality, report.model
@@ -319,12 +378,21 @@ def _number(value: float | None, how: str) -> str:
     return "—" if value is None else how.format(value)
 
 
+def row_name(key: str) -> str:
+    """Return the name of an entry of capture, settings, machine or model as Markdown text."""
+    return _ROWS.get(key) or escape(key)
+
+
 def value_text(key: str, value: Any) -> str:
     """Return one value of capture, settings, machine or model as text."""
     if value is None:
         return "—"
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if key == "trained_seconds":
+        return duration(value)
+    if key == "expected_psnr":
+        return " to ".join(f"{bound:.1f}" for bound in value)
     if key == "bytes" and isinstance(value, int | float):
         return f"{value / 1e6:,.1f} MB"
     if isinstance(value, int) and abs(value) >= 10_000 and key != "seed":

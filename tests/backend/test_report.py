@@ -18,6 +18,7 @@ from backend.shared.color.palette import UNLABELED, colors_of, object_colors, to
 from backend.shared.errors import InputError
 from backend.shared.reconstruction.folder import Reconstruction
 from backend.shared.reconstruction.report import Report, complete, read_report
+from backend.training.settings import Settings
 
 
 def a_report():
@@ -278,6 +279,23 @@ def test_mesh_table_without_truth_omits_columns(reconstruction):
     write_report(reconstruction, Report(**report))
     section = reconstruction.report_md.read_text(encoding="utf-8").split("## Meshes")[1]
     assert "F1" not in section and "Chamfer" not in section and "Texture" in section
+
+
+def test_tables_have_words_and_units_instead_of_keys(reconstruction):
+    report = Report(
+        model={"psnr_of_export": 132.53, "trained_seconds": 177.0, "expected_psnr": [28.04, 37.8], "bytes": 13_400_000},
+        settings=Settings().as_dict(),
+        machine={"memory_gb": 25.3, "numpy": "2.4.6"},
+    )
+    write_report(reconstruction, report)
+    text = reconstruction.report_md.read_text(encoding="utf-8")
+    for row in (
+        "PSNR of splats.ply against the model, dB | 132.53 |", "Time of all training | 2 min 57 s |",
+        "Expected PSNR, colors corrected, dB | 28.0 to 37.8 |", "Size of splats.ply | 13.4 MB |",
+        "`--semantic-weight` | 0.1 |", "Memory, GB | 25.3 |", "numpy | 2.4.6 |",
+    ):  # fmt: skip
+        assert f"| {row}" in text, row
+    assert "\\_" not in text, "a raw key"
 
 
 def test_names_are_escaped_in_tables(reconstruction):
