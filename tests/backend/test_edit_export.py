@@ -140,7 +140,10 @@ def test_edit_without_options_lists_edits(run_command, folder):
 def test_recolor_middle_is_mean_luma(run_command, folder):
     splats = read_splats(folder.splats)[0]
     own = splats.select(splats.object_ids == 7)
-    run_command("edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00")
+    result = run_command(
+        "edit", folder.folder, "--recolor", "can:hue=0.3, saturation=0.5", "mug:replace=#ff0080,tint=#00ff00"
+    )
+    assert "can: recolored hue=0.3 saturation=0.5\n" in result.out, "and no middle, which is no option"
     can, mug = edited(folder, 7).recolor, edited(folder, 1).recolor
     assert (can.hue, can.saturation, mug.amount, mug.tint) == (0.3, 0.5, 1.0, (0, 1, 0))
     assert mug.replace == pytest.approx((1, 0, 128 / 255))

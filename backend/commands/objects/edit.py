@@ -137,6 +137,8 @@ def _described(entry: SceneObject, new_splats: int | None) -> list[str]:
     words += ["floaters hidden"] if entry.cleaned else []
     if entry.recolor:
         stored = entry.recolor.stored() or {}
+        # Which is no option, but follows from the object.
+        stored.pop("middle", None)
         words.append("recolored " + " ".join(f"{key}={_short(value)}" for key, value in stored.items()))
     if entry.transform:
         scale = abs(np.linalg.det(np.array(entry.transform)[:3, :3])) ** (1 / 3)
