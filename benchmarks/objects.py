@@ -136,9 +136,11 @@ def document(found: Mapping[str, Any]) -> str:
         "# Cost of objects",
         "",
         f"Made by `python benchmarks/objects.py --write`: trainings of {found['steps']} steps on the demo's photos, "
-        "whose surfaces are split into more and more objects, on two cores of a server CPU. Frames a second are those "
-        "of 320x240 pixels with object IDs. The rasterizer blends one probability, that of a pixel's label, whatever "
-        "the number of objects; only the map of the most probable objects looks at several.",
+        "whose surfaces are split into more and more objects, on two cores of a server CPU. These objects are the "
+        "cells of a grid in space, whose borders no photo shows, so their mIoU says little about real objects. Frames "
+        "a second are those of 320x240 pixels with object IDs. The rasterizer blends one "
+        "probability, that of a pixel's label, whatever the number of objects; only the map of the most probable "
+        "objects looks at several.",
         "",
         *shared.table(
             ("objects", "seconds", "times the least", "frames a second", "memory", "splats", "PSNR", "mIoU"), rows
