@@ -124,7 +124,7 @@ def expectation(
     length, quality = "", []
     if typical is not None:
         bounds = _in_decibels(expected_psnr(typical, steps, seconds, pixels, trained))
-        quality.append(f"PSNR of {bounds} on held-out views, as on 80% of captures")
+        quality.append(f"PSNR of {bounds} on held-out views with their colors corrected, as on 80% of captures")
     if outlook is not None:
         where = "" if all(trained) or not outlook.slowest else " on a CPU"
         if steps is None:

@@ -89,7 +89,7 @@ def test_typical_quality_of_the_capture_gives_an_interval(monkeypatch):
     assert typical == pytest.approx(28.0)
     assert expectation.expected_psnr(typical, 400, None, None) == pytest.approx((23.5, 29.5))
     assert expectation.expected_psnr(typical, None, 60.0, None) == pytest.approx((25.0, 31.0)), "unknown speed"
-    interval = "PSNR of 24 to 30 dB on held-out views, as on 80% of captures"
+    interval = "PSNR of 24 to 30 dB on held-out views with their colors corrected, as on 80% of captures"
     assert expected(400, None, None, (0, 0.0), typical) == f"Expected: {interval}; 1.0 to 2.0 dB below {FINAL}"
     assert expected(None, None, None, (0, 0.0), typical).startswith("Expected: PSNR of 25 to 31 dB")
     words = expectation.expectation_in_words
