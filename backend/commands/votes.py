@@ -24,7 +24,7 @@ VOTE = "vote"
 
 def cast_votes(folder: Reconstruction, capture: Capture, options: argparse.Namespace, reporter: Reporter) -> None:
     """Vote on the objects of the capture's points; writes points.ply and objects.json."""
-    reporter.begin(VOTE, "Voting on the objects of the points")
+    reporter.begin(VOTE, "Voting on the objects of the points" if capture.has_masks else "Writing the points")
     with stage(folder, "vote"):
         votes = vote_points(capture, options.strategy, options.seed, reporter=reporter)
         colors = object_colors(votes.counts)

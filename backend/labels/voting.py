@@ -106,7 +106,6 @@ def vote(
 
     xyz = np.ascontiguousarray(voters.T, np.float64)
     nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
-    reporter.status("Voting")
     for done, index in enumerate(indices, 1):
         observed = None
         if strategy == "correspondence" or occlusion:

@@ -84,6 +84,7 @@ def test_full_pipeline(write_capture, tmp_path, run_command, masks):
     objects = json.loads((out / "objects.json").read_text())["objects"]
     assert [entry["id"] for entry in objects] == ([1, 2, 5] if masks else [])
     assert any("masks" in message for message in voted.messages("warning")) is not masks
+    assert any("Voting" in message for message in voted.messages("status")) is masks
 
     ended = run_command("train", capture, "--out", out, "--steps", 20, *SMALL, "--json")
     assert ended.code == EXIT_DONE and ended.events[-1]["steps"] == 20
