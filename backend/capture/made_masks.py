@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..shared.errors import InputError
-from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file
+from ..shared.formats.atomic import PART_PREFIX, PART_SUFFIX, replace_file, require_still_there
 from ..shared.formats.json_file import read_json
 from ..shared.reconstruction.folder import STROKES
 from .files import encode_mask
@@ -106,5 +106,6 @@ def write_mask(folder: Path, name: str, mask: np.ndarray) -> None:
     """Write the mask (h, w) of the photo `name` to a folder of masks."""
     suffix, data = encode_mask(mask)
     path = folder / (name + suffix)
+    require_still_there(folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data)

@@ -184,6 +184,12 @@ def _describe_error(error: Exception, trains: bool) -> str | None:
     if isinstance(error, ModuleNotFoundError):
         return describe_missing_package(error)
     if isinstance(error, OSError) and error.filename:
+        parent = Path(str(error.filename)).parent
+        if error.errno == errno.ENOENT and not parent.is_dir():
+            return (
+                f"{error.filename} cannot be used, since the folder {parent} does not exist; connect its disk or "
+                "create it."
+            )
         full = is_lack_of_space(error)
         problem = "could not be written" if full else "cannot be used"
         advice = "free some space and run the same command again" if full else "check it and its permissions"

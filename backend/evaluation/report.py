@@ -57,7 +57,7 @@ def write_report(
     """
     report = complete(report)
     folder = reconstruction.pictures
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(exist_ok=True)
     # The objects' IoU whose mean is the leading mIoU.
     iou = {"miou_all": "iou_all", "miou": "iou"}[report.lead_miou]
     shown, rule = choose_objects(report.objects, iou)

@@ -16,7 +16,7 @@ import numpy as np
 from ..shared.durations import awake_seconds
 from ..shared.errors import InputError, is_lack_of_space
 from ..shared.events import Reporter
-from ..shared.formats.atomic import atomic_file, make_folder, replace_file
+from ..shared.formats.atomic import atomic_file, make_folder, replace_file, require_still_there
 from ..shared.formats.json_file import parse_json
 from ..shared.formats.regular_file import open_regular
 from ..shared.reconstruction.checkpoint import CURRENT, FORMAT, LENGTH_BYTES, PREVIOUS, stored_header
@@ -105,7 +105,7 @@ def save_checkpoint(
     """Write a checkpoint; after the first one, `folder` contains a complete checkpoint at any time.
 
     Args:
-        folder: created if necessary.
+        folder: created if necessary, in one that exists.
         tensors: tensors by name.
         state: JSON-serializable state.
         keep_current: keep the current checkpoint as the previous one. Without it, the current one is replaced and the
@@ -114,6 +114,7 @@ def save_checkpoint(
     Raises:
         InputError: the file cannot be written; the previous checkpoint can still be loaded.
     """
+    require_still_there(folder.parent)
     try:
         make_folder(folder)
         with atomic_file(folder / CURRENT) as file:

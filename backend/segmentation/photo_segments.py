@@ -16,7 +16,7 @@ from ..capture.files import read_image, read_mask
 from ..capture.mask_sources.segments import Segments, Shape, draw_shapes
 from ..networks.checkpoint_folder import CONFIG
 from ..shared.errors import InputError
-from ..shared.formats.atomic import make_folder, write_atomic
+from ..shared.formats.atomic import make_folder, require_still_there, write_atomic
 from ..shared.formats.json_file import parse_json
 
 _VERSION = 3
@@ -154,6 +154,7 @@ class PhotoSegments:
     def _keep(self, name: str, stamp: list[int], found: Segments) -> None:
         stream, names = io.BytesIO(), np.array(found.names, np.str_)
         np.savez_compressed(stream, ids=found.numbers.astype(np.uint16), names=names, photo=np.array(stamp, np.int64))
+        require_still_there(self._images)
         make_folder(self._path(name).parent)
         write_atomic(self._path(name), stream.getvalue())
 

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 
 from ..shared.errors import InputError
-from ..shared.formats.atomic import replace_file, write_atomic
+from ..shared.formats.atomic import replace_file, require_still_there, write_atomic
 from ..shared.formats.photos_source import SOURCE, WORK
 from ..shared.photos.former_model import forget_former, keep_former, put_former_back
 from . import database
@@ -167,7 +167,8 @@ def remove_points(model: pycolmap.Reconstruction, ids: np.ndarray) -> None:
 def write_model(model: pycolmap.Reconstruction, capture: Path) -> None:
     """Write a model as the sparse/0 of a capture, replacing the one there at the end."""
     target = capture / SPARSE
-    target.parent.mkdir(parents=True, exist_ok=True)
+    require_still_there(capture)
+    target.parent.mkdir(exist_ok=True)
     part, old = target.with_name("new"), target.with_name("old")
     for folder in (part, old):
         shutil.rmtree(folder, ignore_errors=True)

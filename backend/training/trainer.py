@@ -23,6 +23,7 @@ from ..raster import devices
 from ..shared.durations import awake_seconds
 from ..shared.errors import Cancelled, InputError, ProcessLost, is_lack_of_memory
 from ..shared.events import Reporter
+from ..shared.formats.atomic import require_still_there
 from ..shared.stopping import Check, StopRequest, proceed
 from . import check_finite, overfitting
 from .budget import Budget, TrainingProgress, objective_of, plateau_end
@@ -248,6 +249,7 @@ class Trainer:
         except Exception as error:
             expected = isinstance(error, (InputError, OSError, ProcessLost)) or is_lack_of_memory(error)
             if expected and self.progress.step > first_step and self.optimizer.is_complete:
+                require_still_there(checkpoints.parent)
                 self.scene.forget()
                 with suppress(InputError, OSError, MemoryError):
                     self.save(checkpoints)
@@ -392,8 +394,7 @@ class Trainer:
 
     def _compute(self, progress: float) -> tuple[Outcome, Exception | None]:
         """Compute the gradients of this process' view; returns them, or the error that prevents it."""
-        p, team = self.progress, self._team
-        step = p.step + team.rank
+        p, team, step = self.progress, self._team, self.progress.step + self._team.rank
         try:
             if team.rank:
                 self.view_step.expected_changes = functools.partial(

@@ -595,6 +595,30 @@ def test_one_checkpoint_at_an_interval_may_fail(tiny, tmp_path, monkeypatch, fai
     assert load_checkpoint(tmp_path)[1]["progress"]["step"] == trainer.progress.step == 6
 
 
+@pytest.mark.parametrize("photos", [True, False])
+def test_folder_that_is_gone_is_not_made_again(tiny, tmp_path, monkeypatch, photos):
+    """A disk may be unplugged, with the photos or without; the next one at its place is to get its name."""
+    trainer, folder, warnings, reporter = Trainer.start(*tiny(), SMALL), tmp_path / "disk" / "rec", [], Reporter()
+    folder.mkdir(parents=True)
+    trainer.save(folder / "checkpoint")
+
+    def step(_):
+        trainer.progress.step += 1
+        if trainer.progress.step == 2:
+            (tmp_path / "disk").rename(tmp_path / "away")
+            if photos:
+                raise InputError("a photo cannot be read")
+        return torch.tensor(1.0)
+
+    monkeypatch.setattr(trainer, "step", step)
+    monkeypatch.setattr(checkpoint, "seconds_to_next", lambda *_: 0.0)
+    reporter.warning = warnings.append
+    with pytest.raises(InputError, match="rec is gone; connect its disk"):
+        trainer.run(Budget(steps=6), folder / "checkpoint", reporter, checkpoint_seconds=0.0)
+    assert not (tmp_path / "disk").exists() and all("rec is gone)" in sentence for sentence in warnings)
+    assert load_checkpoint(tmp_path / "away" / "rec" / "checkpoint")[1]["progress"]["step"] == 1
+
+
 @pytest.mark.parametrize("where", ["a view", "growth"])
 def test_steps_before_a_lack_of_memory_are_saved(tiny, tmp_path, monkeypatch, where):
     """But not a model whose anchors have changed in part."""

@@ -30,7 +30,7 @@ from ...sfm.sources.stamps import IMAGES
 from ...sfm.stages import run_stage
 from ...shared.errors import Cancelled, InputError
 from ...shared.events import Reporter
-from ...shared.formats.atomic import make_folder, recorded
+from ...shared.formats.atomic import make_folder, recorded, require_still_there
 from ...shared.formats.file_names import legible
 from ...shared.formats.json_file import read_json, write_json
 from ...shared.formats.photos_source import (
@@ -210,6 +210,7 @@ def _run(made_from: PhotosSource, capture: Path, reporter: StoppingReporter) -> 
         reporter.begin(mapper, f"Computing poses ({mapper})")
         out = work / mapper
         shutil.rmtree(out, ignore_errors=True)
+        require_still_there(work)
         make_folder(out)
         arguments = [mapper, str(path), str(images), str(out), str(listed_names), *calibrated]
         has_failed |= not run_stage(reporter, log, arguments, lambda lines: lines, count)
@@ -311,6 +312,7 @@ def _refined(
     before, after = path.parent / "chosen", path.parent / "refined"
     for folder in (before, after):
         shutil.rmtree(folder, ignore_errors=True)
+        require_still_there(path.parent)
         make_folder(folder)
     found.write(before)
     if run_stage(reporter, log, ["refine", str(before), str(after), str(path), *options], lambda lines: lines, 1):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ...editing import apply_splat_edits, compute_fill
 from ...export import read_splats, splat_table
+from ...shared.formats.atomic import require_still_there
 from ...shared.reconstruction.fill import FillRows, fill_path, read_fill, write_fill
 from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.objects import read_objects
@@ -24,6 +25,7 @@ def fill_holes(folder: Reconstruction, reporter: StoppingReporter) -> dict[int, 
     objects = read_objects(folder.objects)
     while (path := fill_path(folder, objects)) is not None and not path.is_file():
         reporter.begin(FILL, "Filling the holes of removed and moved objects")
+        require_still_there(folder.folder)
         path.parent.mkdir(parents=True, exist_ok=True)
         splats = apply_splat_edits(read_splats(folder.splats)[0], folder)[0]
         if fill_path(folder, objects) != path:

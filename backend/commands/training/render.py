@@ -13,7 +13,7 @@ from PIL import Image
 
 from ...evaluation.images import as_bytes
 from ...model.draw import draw
-from ...shared.formats.atomic import write_atomic
+from ...shared.formats.atomic import require_still_there, write_atomic
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, open_trained
 from ..stages import stage
@@ -33,6 +33,7 @@ def render(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         for done, index in enumerate(indices, 1):
             rendered = draw(trained.model, trained.scene.camera(index), options.ids, options.depth)
             path = paths[index]
+            require_still_there(folder.folder)
             path.parent.mkdir(parents=True, exist_ok=True)
             _save_png(path, as_bytes(rendered.image))
             if rendered.ids is not None:

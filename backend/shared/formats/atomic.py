@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import time
@@ -9,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+from ..errors import InputError
 
 PART_PREFIX, PART_SUFFIX = ".objectgs-", ".part"
 """Beginning and end of the names of temporary files."""
@@ -83,6 +86,18 @@ def make_folder(path: Path) -> None:
             continue  # Another process was faster.
         for record in _records:
             record.add_folder(folder)
+
+
+def require_still_there(folder: Path) -> None:
+    """Raise InputError if a folder that existed when the command began is gone, as of a disk that was unplugged.
+
+    It is asked before folders are made in it, which would otherwise take its place where the disk was.
+    """
+    if not folder.is_dir():
+        raise InputError(
+            f"The folder {folder} is gone; connect its disk or put it back, and run the same command again to continue "
+            "from what was saved there."
+        ) from FileNotFoundError(errno.ENOENT, f"{folder} is gone", str(folder))
 
 
 def remove_abandoned(folder: Path) -> None:
