@@ -179,11 +179,12 @@ def locked_reconstruction(options: argparse.Namespace) -> Iterator[None]:
     """Lock the reconstruction of a command, before it is read, so that nothing changes in between.
 
     Raises:
-        InputError: as `require_reconstruction`.
+        InputError: as `require_reconstruction`, or the folder cannot be written to.
         FolderInUse: another process has locked it.
     """
     folder = Reconstruction(options.folder)
     require_reconstruction(folder)
+    folder.require_writable()
     with locked(folder.folder):
         yield
 

@@ -9,6 +9,7 @@ import struct
 import sys
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,6 +136,40 @@ def test_edit_without_options_lists_edits(run_command, folder):
     before = folder.objects.read_bytes()
     result = run_command("edit", folder.folder)
     assert result.code == EXIT_DONE and "7 can: as captured" in result.out and folder.objects.read_bytes() == before
+
+
+def test_folders_that_cannot_be_written_to_are_refused_at_the_start(run_command, folder, tmp_path, monkeypatch):
+    """Listing edits still works."""
+    write, place = Path.write_bytes, tmp_path / "out"
+    place.mkdir()
+    update_record(folder)
+
+    def write_bytes(path, data):
+        if path.parent in (folder.folder, place):
+            raise OSError(30, "Read-only file system", str(path))
+        return write(path, data)
+
+    def refuse(*_):
+        raise AssertionError("it has begun")
+
+    monkeypatch.setattr(Path, "write_bytes", write_bytes)
+    for name in ("edit", "export"):
+        monkeypatch.setattr(f"backend.commands.objects.{name}.read_splats", refuse)
+    monkeypatch.setattr("backend.shared.reconstruction.objects.locked", refuse)
+    listed = run_command("edit", folder.folder)
+    assert listed.code == EXIT_DONE and "7 can: as captured" in listed.out
+    refused = {
+        folder.folder: [("edit", folder.folder, "--move", "can:x=1"), ("evaluate", folder.folder),
+                        ("report", folder.folder), ("render", folder.folder), ("mesh", folder.folder),
+                        ("propose", folder.folder)],
+        place: [("export", folder.folder, "--out", place / "a.ply"),
+                ("export", folder.folder, "--out", place / "new", "--per-object"),
+                ("propose", folder.folder, "--strokes", place / "a.json")],
+    }  # fmt: skip
+    for at, commands in refused.items():
+        for words in commands:
+            result = run_command(*words)
+            assert f"The folder {at} cannot be written to (Read-only file system); " in result.err, words
 
 
 def test_recolor_middle_is_mean_luma(run_command, folder):

@@ -26,6 +26,10 @@ _NONE: dict[str, Any] = dict.fromkeys(("removed", "floaters", "fill", "cleaned",
 """Resets every edit of an object that this command makes."""
 
 
+_CHANGES = ("reset", "restore", "remove", "restore_floaters", "clean_floaters", "recolor", "move", "duplicate")
+"""Options that change objects; without them, the command lists edits and also works in a folder that is read-only."""
+
+
 def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Store the edits of the options, fill the holes of removed and moved objects, and report all edits."""
     folder = Reconstruction(options.folder)
@@ -43,10 +47,14 @@ def edit(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         edited = len(found)
         return found
 
+    is_change = any(getattr(options, name) for name in _CHANGES)
+    if is_change:
+        folder.require_writable()
     # Read before objects.json is locked, since it can take long.
     needs_splats = options.recolor or options.move or options.duplicate
     splats = apply_splat_edits(read_splats(folder.splats)[0], folder)[0] if needs_splats else None
-    edit_objects(folder.objects, changes)
+    if is_change:
+        edit_objects(folder.objects, changes)
     new_splats = fill_holes(folder, reporter)
     # As one message, since a status display shows only the latest one.
     lines = [

@@ -27,7 +27,7 @@ from ...shared.errors import InputError
 from ...shared.formats.file_names import distinct_stems
 from ...shared.formats.regular_file import resolved
 from ...shared.formats.splat_ply import Description
-from ...shared.reconstruction.folder import Reconstruction
+from ...shared.reconstruction.folder import Reconstruction, require_writable
 from ...shared.reconstruction.objects import SceneObject, default_name, find_object, read_objects
 from ...shared.reconstruction.record import Record, read_record
 from ...shared.stopping import StoppingReporter
@@ -53,6 +53,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         raise InputError("--to-world is for --coordinates blender; add this, or leave out --to-world.")
     if options.per_object and resolved(options.out) == resolved(folder.folder):
         raise InputError(f"{options.out} is the reconstruction's own folder; name another one for the objects' files.")
+    require_writable(options.out if options.per_object else options.out.parent, "choose another with --out")
     kind = _format(options)
     objects = read_objects(folder.objects) if folder.objects.exists() else []
     found = [find_object(objects, word, folder.objects) for word in options.objects or ()]

@@ -11,6 +11,7 @@ from ...evaluation.images import MaskSheet
 from ...pointing.strokes import content_of
 from ...shared.errors import InputError
 from ...shared.formats.json_file import write_json
+from ...shared.reconstruction.folder import Reconstruction, require_writable
 from ...shared.stopping import StoppingReporter
 from ..folder import READ
 from ..setup.kernels import PART as KERNELS
@@ -28,6 +29,10 @@ def propose(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             _DRAW: ("Finding objects", 3.0),
         }
     )  # fmt: skip
+    if options.strokes is None:
+        Reconstruction(options.folder).require_writable()
+    else:
+        require_writable(options.strokes.parent, "choose another with --strokes")
     opened = open_pointable(options, reporter)
     ensure_kernels(reporter, opened.device)
     reporter.begin(GRAPH, "Comparing the splats with their neighbors")

@@ -12,6 +12,7 @@ from ...evaluation.meshes import evaluate_mesh, mesh_entries
 from ...evaluation.truth import load_truth
 from ...model.draw import draw, objects_alone
 from ...shared.errors import NothingMade
+from ...shared.reconstruction.folder import Reconstruction
 from ...shared.reconstruction.report import Evaluation, write_evaluation
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, Trained, open_trained
@@ -22,6 +23,7 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Measure splats and meshes on the held-out views, and write evaluation.json, which `report` reads."""
     parts = {READ: ("Preparing", 5.0), "views": ("Measuring the views", 20.0), "meshes": ("Measuring the meshes", 20.0)}
     reporter.expect(parts)
+    Reconstruction(options.folder).require_writable()
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     if not capture.test_indices:
@@ -41,9 +43,14 @@ def evaluate(options: argparse.Namespace, reporter: StoppingReporter) -> None:
             trained.scene.supervise_background,
             lambda index: objects_alone(trained.model, trained.scene.camera(index)),
         )  # fmt: skip
+        quality = {name: value for name, value in found["quality"].items() if value is not None}
+        # Before the meshes, which take longer, and the file, which may not be written.
+        miou = "miou_all" if trained.scene.supervise_background else "miou"
+        named = (("psnr", "PSNR of {:.2f} dB"), (miou, "mIoU of {:.3f}"))
+        measured = ", ".join(words.format(quality[name]) for name, words in named if name in quality)
+        reporter.status(f"Measured on the held-out views: {measured}")
         meshes = _meshes(trained, reporter)
     write_evaluation(folder.folder, Evaluation(trained.progress.step, **found, meshes=meshes))
-    quality = {name: value for name, value in found["quality"].items() if value is not None}
     figures = {name: round(float(value), 4) for name, value in quality.items()}
     reporter.done(**figures, zero_is_background=trained.scene.supervise_background)
 

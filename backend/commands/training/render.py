@@ -14,6 +14,7 @@ from PIL import Image
 from ...evaluation.images import as_bytes
 from ...model.draw import draw
 from ...shared.formats.atomic import require_still_there, write_atomic
+from ...shared.reconstruction.folder import Reconstruction
 from ...shared.stopping import StoppingReporter
 from ..folder import READ, open_trained
 from ..stages import stage
@@ -22,6 +23,7 @@ from ..stages import stage
 def render(options: argparse.Namespace, reporter: StoppingReporter) -> None:
     """Render views into DIR/renders, under the names of the images."""
     reporter.expect({READ: ("Preparing", 5.0), "views": ("Rendering", 20.0)})
+    Reconstruction(options.folder).require_writable()
     trained = open_trained(options, reporter)
     folder, capture = trained.folder, trained.capture
     indices = list(capture.test_indices)

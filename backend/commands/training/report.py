@@ -43,6 +43,7 @@ def report(options: argparse.Namespace, reporter: StoppingReporter) -> None:
         "write": ("Saving", 2.0),
     }
     reporter.expect(parts)
+    Reconstruction(options.folder).require_writable()
     trained = open_trained(options, reporter)
     folder, capture, model, progress = trained.folder, trained.capture, trained.model, trained.progress
     evaluation = _evaluation(folder, progress, reporter)

@@ -86,11 +86,25 @@ class Reconstruction:
         """Create the folder and return self; raise InputError if it is not writable."""
         try:
             make_folder(self.folder)
-            probe = self.folder / f"{PART_PREFIX}write-test-{os.getpid()}{PART_SUFFIX}"
-            probe.write_bytes(b"")
-            probe.unlink()
         except OSError as error:
             raise InputError(
                 f"The folder {self.folder} cannot be written to ({error.strerror}); choose another with --out."
             ) from error
+        require_writable(self.folder, "choose another with --out")
         return self
+
+    def require_writable(self) -> None:
+        """Raise InputError if the folder exists and cannot be written to, for commands that do so at their end."""
+        if self.folder.is_dir():
+            require_writable(self.folder, "check its permissions, or copy it to another place")
+
+
+def require_writable(folder: Path, advice: str) -> None:
+    """Raise InputError with `advice` if a folder, or the nearest existing one that it is in, cannot be written to."""
+    folder = next((parent for parent in (folder, *folder.parents) if parent.is_dir()), folder)
+    probe = folder / f"{PART_PREFIX}write-test-{os.getpid()}{PART_SUFFIX}"
+    try:
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"The folder {folder} cannot be written to ({error.strerror}); {advice}.") from error
