@@ -43,6 +43,8 @@ from .undistort import Pinhole, is_pinhole, pinhole_for, scaled
 Problem = Callable[[str], None]
 """Handler of a problem, given as a sentence; either raises or collects it."""
 
+_CONVERTED = (".exr", ".json", ".xml")
+"""Kinds of files of other programs that `masks` makes masks of, and that are none themselves."""
 _PIXELS_AT_ONCE = 100_000_000
 """Number of pixels that may be processed at a time, with about 15 bytes for each."""
 _LARGEST = 4
@@ -199,8 +201,10 @@ def survey_capture(
         first = masks_folder / Path(unmasked[0]).with_suffix(".png")
         # Masks made here are of the photos that somebody has annotated or that are trained on.
         if 2 * len(unmasked) > present and not is_made(masks_folder):
+            assert masks is not None
             problem(
-                f"The mask {first} is missing, as are those of {len(unmasked)} of {present} images: add them, or "
+                _unconverted(masks)
+                or f"The mask {first} is missing, as are those of {len(unmasked)} of {present} images: add them, or "
                 f"remove {masks_folder} to work without objects."
             )
         elif not (masks_folder / STROKES).is_file():
@@ -227,6 +231,18 @@ def survey_capture(
         folder, model, sources, names, warnings, counts, _is_color_coded(sources, problem), held_out,
         on_objects=made_from is not None and made_from.features == "objects",
     )  # fmt: skip
+
+
+def _unconverted(masks: Files) -> str | None:
+    """Return a sentence about a folder of masks that has none but those of other programs; None for other folders."""
+    kinds = Counter(Path(path).suffix.lower() for path in masks.paths)
+    if not kinds or not kinds.keys() <= set(_CONVERTED):
+        return None
+    files = " and ".join(f"{count} {suffix} file{'s' * (count > 1)}" for suffix, count in kinds.items())
+    return (
+        f"{masks.folder} contains {files}, which must be converted to masks: use `masks` (Import Masks) with this "
+        "folder, or remove it to work without objects."
+    )
 
 
 def _held_out(folder: Path, model: Model, sources: list[Source]) -> frozenset[str] | None:

@@ -729,6 +729,16 @@ def test_few_missing_masks_are_allowed(write_capture, tmp_path):
     assert_load_rejected(scene.folder, tmp_path, "masks/view_000.png", "missing", "4 of 6")
 
 
+def test_masks_to_be_converted_are_not_called_missing(write_capture, tmp_path):
+    scene = write_capture(views=3)
+    for name in scene.names:
+        mask = scene.folder / "masks" / name
+        mask.rename(mask.with_suffix(".exr"))
+    assert_load_rejected(scene.folder, tmp_path, "masks contains 3 .exr files", "use `masks` (Import Masks)")
+    (scene.folder / "masks" / "annotations.xml").touch()
+    assert_load_rejected(scene.folder, tmp_path, "1 .xml file and 3 .exr files", "Import Masks")
+
+
 def test_capture_without_masks_loads(write_capture, tmp_path):
     capture = load_capture(write_capture(masks=False).folder, tmp_path / "cache")
     assert not capture.has_masks and capture.mask(0) is None and len(capture.object_ids) == 0
