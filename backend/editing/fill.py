@@ -191,7 +191,7 @@ def _plane(
     """Find the plane that touches the object's centers, solid (m, 3), and contains the most of points (n, 3).
 
     A plane contains points that are within the distance `within` and whose thin axes (n, 3) are along its normal.
-    Planes parallel to those in `before` are excluded. Returns None if there is no plane.
+    Planes parallel to those in `before`, within `ALIGNED`, are excluded. Returns None if there is no other.
     """
     if len(points) < FEWEST:
         return None
@@ -209,8 +209,7 @@ def _plane(
         if np.median(heights) < 0:
             normal, heights = -normal, -heights
         lowest = np.percentile(heights, LOWEST_PERCENT)
-        parallel = any(abs(other.axes[2] @ normal) > ALIGNED for other in before)
-        if parallel or not -within <= lowest <= TOUCHES_WITHIN * size:
+        if _is_parallel(normal, before) or not -within <= lowest <= TOUCHES_WITHIN * size:
             continue
         count = ((np.abs((some - corner) @ normal) < within) & (np.abs(some_thin @ normal) > ALIGNED)).sum()
         if count > most:
@@ -224,7 +223,12 @@ def _plane(
         axes = np.linalg.svd(points[inliers] - point, full_matrices=False)[2]
         axes *= np.sign(axes[2] @ normal)
         inliers = (np.abs((points - point) @ axes[2]) < within) & (np.abs(thin @ axes[2]) > ALIGNED)
-    return _Plane(point, axes)
+    # What is left of a rough surface may fit to a tilted plane, which turns to that surface then.
+    return None if _is_parallel(axes[2], before) else _Plane(point, axes)
+
+
+def _is_parallel(normal: NDArray, planes: list[_Plane]) -> bool:
+    return any(abs(plane.axes[2] @ normal) > ALIGNED for plane in planes)
 
 
 class _Surface:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from backend.editing import apply_edits, compute_fill, recolored, transformed
+from backend.editing import apply_edits, compute_fill, fill, recolored, transformed
 from backend.editing.floaters import inside_hull
 from backend.model.splats import Splats, concatenate
 from backend.raster.camera import Camera
@@ -326,15 +326,30 @@ def test_fill_follows_curved_ground():
     assert np.abs(height(splats.means[splats.object_ids == 5])).mean() > 0.03
 
 
+@pytest.mark.parametrize("within", [0.02, 0.04, 0.08])
+def test_ridge_of_ground_is_no_further_plane(within):
+    """Planes through it may be steep, but the one that fits is tilted little to the ground."""
+    rng = np.random.default_rng(0)
+    across, normal = np.array([0, np.cos(0.42), np.sin(0.42)]), np.array([0, -np.sin(0.42), np.cos(0.42)])
+    along, wide, high = rng.uniform(-1, 1, (3, 2000, 1))
+    ridge = 0.5 * along * np.array([1, 0, 0]) + 0.03 * wide * across + 0.005 * high * normal + np.array([0, -0.1, 0.06])
+    standing = rng.normal((0, 0, 0.5), 0.15, (3000, 3))
+    ground = fill._Plane(np.zeros(3), np.eye(3))
+    arguments = ridge, np.tile(normal, (2000, 1)), standing, 1.0, within
+    assert fill._plane(*arguments, [ground]) is None
+    alone = fill._plane(*arguments, [])
+    assert alone is not None and alone.axes[2] @ normal > 0.99
+
+
 def test_compute_fill_matches_applied_edits():
     splats, _ = with_box_on_ground()
     objects = [scene_object(1, removed=True, fill=True), scene_object(6, removed=True, fill=True)]
-    fill = compute_fill(splats, objects)
+    filling = compute_fill(splats, objects)
     edited = apply_edits(splats, objects)
-    assert same(fill.splats.select(fill.put), edited.select(edited.unobserved))
-    assert set(fill.fills.tolist()) == {1, 6} and fill.splats.unobserved.tolist() == fill.put.tolist()
+    assert same(filling.splats.select(filling.put), edited.select(edited.unobserved))
+    assert set(filling.fills.tolist()) == {1, 6} and filling.splats.unobserved.tolist() == filling.put.tolist()
     kept = splats.select(np.isin(splats.object_ids, [1, 6], invert=True))
-    taken = fill.splats.select(~fill.put)
+    taken = filling.splats.select(~filling.put)
     still = kept.select(~np.isin(kept.means, taken.means).all(1))
     assert len(taken) and same(still, edited.select(~edited.unobserved))
 
