@@ -100,8 +100,8 @@ class Reconstruction:
 
 
 def require_writable(folder: Path, advice: str) -> None:
-    """Raise InputError with `advice` if a folder, or the nearest existing one that it is in, cannot be written to."""
-    folder = next((parent for parent in (folder, *folder.parents) if parent.is_dir()), folder)
+    """Raise InputError with `advice` if a folder, or the nearest existing path above it, cannot be written to."""
+    folder = next((parent for parent in (folder, *folder.parents) if parent.exists()), folder)
     probe = folder / f"{PART_PREFIX}write-test-{os.getpid()}{PART_SUFFIX}"
     try:
         probe.write_bytes(b"")
