@@ -70,6 +70,13 @@ def content(root: bpy.types.Collection) -> dict[str, Any]:
     return {"objects": names, "everything": properties.everything, "strokes": strokes_of(root)}
 
 
+def take_name(root: bpy.types.Collection, object_id: int, name: str) -> None:
+    """Give a marked object the name that its row in the list of objects has got, if both have this stored ID."""
+    for item in root.objectgs.marked:
+        if item.object_id == object_id and item.name != name:
+            item.name = name
+
+
 def count(root: bpy.types.Collection, object_id: int) -> int:
     """Return the number of strokes on an object."""
     return sum(stroke["object"] == object_id for stroke in strokes_of(root))

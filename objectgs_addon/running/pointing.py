@@ -120,8 +120,8 @@ class _Session:
                 return None
             if "problem" in event:
                 self.answered = self.asked
-                self.problem = str(event["problem"])
                 number = event.get("stroke")
+                self.problem = str(event["problem"]).replace(f"Stroke {number} ", "A stroke ", 1)  # None shows it.
                 return number if isinstance(number, int) else None
             self._take_classes(event)
         return None

@@ -68,11 +68,16 @@ def image_size() -> Any:
     )
 
 
+def _name_changed(item: Any, context: bpy.types.Context) -> None:
+    object_edits.name_changed(item, context)
+    marks.take_name(item.id_data, item.object_id, item.name)
+
+
 class ObjectItem(bpy.types.PropertyGroup):
     """A row of the objects list; IDs above 2^31 - 1 are stored as the int32 with the same bits."""
 
     name: StringProperty(
-        name="Name", description="Name of the object, kept in the reconstruction", update=object_edits.name_changed
+        name="Name", description="Name of the object, kept in the reconstruction", update=_name_changed
     )
     color: FloatVectorProperty(
         name="Color",

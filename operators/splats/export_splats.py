@@ -34,13 +34,13 @@ class ExportSplats(ExportDialog, bpy.types.Operator):
     coordinates: EnumProperty(
         name="Coordinates",
         items=[
-            ("capture", "Capture", "Coordinates of the captured cameras"),
             (
                 "blender",
                 "Blender",
                 "Positions in Blender, with Set Ground and Set Distance. PLY, Splat and USD are Z up, as USD meshes; "
                 "SPZ and glTF are Y up, as glTF and OBJ meshes",
             ),
+            ("capture", "Capture", "Coordinates of the captured cameras"),
         ],
     )
 

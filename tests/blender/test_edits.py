@@ -756,7 +756,7 @@ def test_films_and_exports_tell_of_edits_in_another_scene(root, folder, tmp_path
 
     def made():
         assert bpy.ops.objectgs.film_frames() == {"FINISHED"}
-        assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
+        assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), coordinates="capture") == {"FINISHED"}
         return [operator for text, operator in told if str(folder / "objects.json") in text]
 
     part(root, "object_parent", 2).location.x += 1.0
@@ -1590,7 +1590,7 @@ def test_exported_splats_have_edits_and_can_be_imported(root, folder, backend_py
     activate(root, 1)
     bpy.ops.objectgs.remove_object()
     part(root, "object_parent", 2).location.x += 1.0
-    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all")) == {"FINISHED"}
+    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), coordinates="capture") == {"FINISHED"}
     table = read_vertices(tmp_path / "all.ply")
     assert set(table["object_id"].tolist()) == {0, 2, HUGE}
     for kind in ("glb", "usdc"):
@@ -1622,7 +1622,9 @@ def test_imported_splats_are_named_after_their_scene(file, name):
 @pytest.mark.parametrize("kind", ["spz", "splat"])
 @pytest.mark.long
 def test_splats_of_other_formats_can_be_imported(root, folder, backend_python, tmp_path, kind):
-    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), format=kind) == {"FINISHED"}
+    assert bpy.ops.objectgs.export_splats(filepath=str(tmp_path / "all"), format=kind, coordinates="capture") == {
+        "FINISHED"
+    }
     path = tmp_path / f"all.{kind}"
     assert bpy.ops.objectgs.import_splats(filepath=str(path), folder=str(tmp_path / "again")) == {"FINISHED"}
     other = active()

@@ -689,6 +689,17 @@ def test_answers_to_earlier_strokes_are_ignored(root, session):
     assert session.take({"type": "answer", "request": 2, "problem": "Stroke 2 shows no splats", "stroke": 2}) == 2
 
 
+def test_a_renamed_object_has_its_new_name_among_the_marks(root):
+    marks.add_object(root)
+    marked = root.objectgs.marked[0]
+    row = next(item for item in root.objectgs.objects if item.object_id == 1)
+    marked.object_id = row.object_id
+    row.name = "  old   cup "
+    assert marked.name == row.name == "old cup"
+    row.name = ""
+    assert marked.name == row.name == "old cup"
+
+
 def test_a_problem_is_shown_until_the_marks_change(root, session, monkeypatch):
     shown = {}
     monkeypatch.setattr(messages, "show", lambda text, kind: shown.update({text: kind}))
@@ -705,7 +716,7 @@ def test_a_problem_is_shown_until_the_marks_change(root, session, monkeypatch):
 
     draw()
     refuse()
-    assert shown == {"Stroke 1 shows no splats": "ERROR"} and not marks.strokes_of(root)
+    assert shown == {"A stroke shows no splats": "ERROR"} and not marks.strokes_of(root)
     draw()
     assert not shown
     refuse()

@@ -79,14 +79,16 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
                 write(layout, hidden, "HIDE_ON")
         if (model := pointing.segmenter(root)) is not None:
             write(layout, f"A stroke marks all that {model.name} segments by it.", "INFO")
+        # Names that are changed now would not be those of the objects that it makes.
+        is_fixed = job is not None and job.kind == "label" and not job.is_finished
         if is_active or not properties.objects:
-            _draw_list(layout, properties)
+            _draw_list(layout, properties, is_fixed)
         else:
             # The list of objects above has the same names.
             header, body = layout.panel("OBJECTGS_marked", default_closed=True)
             header.label(text="Marked Objects")
             if body is not None:
-                _draw_list(body, properties)
+                _draw_list(body, properties, is_fixed)
         if is_active:
             _draw_suggesting(layout, properties)
         layout.prop(properties, "everything")
@@ -139,8 +141,9 @@ def _why_hidden(context: bpy.types.Context) -> str:
     return ""
 
 
-def _draw_list(layout: bpy.types.UILayout, properties: Any) -> None:
+def _draw_list(layout: bpy.types.UILayout, properties: Any, is_fixed: bool) -> None:
     row = layout.row()
+    row.enabled = not is_fixed
     row.template_list("OBJECTGS_UL_marked", "", properties, "marked", properties, "active_marked", rows=4)
     column = row.column(align=True)
     column.operator("objectgs.add_marked_object", text="", icon="ADD")
