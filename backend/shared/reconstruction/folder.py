@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -86,6 +87,8 @@ class Reconstruction:
         """Create the folder and return self; raise InputError if it is not writable."""
         try:
             make_folder(self.folder)
+            if not self.folder.is_dir():
+                raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
         except OSError as error:
             raise InputError(
                 f"The folder {self.folder} cannot be written to ({error.strerror}); choose another with --out."
@@ -100,8 +103,8 @@ class Reconstruction:
 
 
 def require_writable(folder: Path, advice: str) -> None:
-    """Raise InputError with `advice` if a folder, or the nearest existing path above it, cannot be written to."""
-    folder = next((parent for parent in (folder, *folder.parents) if parent.exists()), folder)
+    """Raise InputError with `advice` if a folder, or the nearest existing one that it is in, cannot be written to."""
+    folder = next((parent for parent in (folder, *folder.parents) if parent.is_dir()), folder)
     probe = folder / f"{PART_PREFIX}write-test-{os.getpid()}{PART_SUFFIX}"
     try:
         probe.write_bytes(b"")
