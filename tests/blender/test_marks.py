@@ -474,7 +474,7 @@ def test_panel_asks_for_the_surroundings_of_a_single_object(root, session):
     session.take({"type": "status", "message": "Comparing the splats"})
     assert "Comparing the splats" in texts_of(MarkingPanel)
     marks.add_stroke(root, 1, view, [(1, 1), (9, 1)], area=False)
-    assert "Strokes so far are applied when this is done. Press Tab for the next object." in texts_of(MarkingPanel)
+    assert "Comparing the splats. Strokes are applied when this is done" in texts_of(MarkingPanel)
     session.take({"type": "answer", "ready": True, "splats": len(session.keys)})
     answer(session, [1], [0] * len(session.keys))
     assert "mark what it stands on, too" in texts_of(MarkingPanel)

@@ -104,7 +104,7 @@ class MarkingPanel(WithReconstruction, bpy.types.Panel):
             layout.progress(factor=progress, text=f"{100 * progress:.0f} %")
             text = pointing.message()
             if pointing.waiting_strokes(root):
-                text = f"{text}. Strokes so far are applied when this is done."
+                text = f"{text}. Strokes are applied when this is done; press Tab for the next object."
             write(layout, text, rows=_ROWS - 1)
             return
         item, nothing = marks.active_object(root), marks.count(root, marks.NOTHING)
