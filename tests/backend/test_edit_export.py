@@ -282,6 +282,8 @@ def test_export_refuses_unknown_suffixes(run_command, folder, tmp_path):
     assert run_command("export", folder.folder, "--out", tmp_path / "parts.v2", "--per-object").code == EXIT_DONE
     assert run_command("export", folder.folder, "--out", tmp_path / "all").code == EXIT_DONE
     assert len(read_splats(tmp_path / "all")[0]) == 60
+    assert run_command("export", folder.folder, "--out", tmp_path / "all.usd").code == EXIT_DONE
+    assert len(read_usd(tmp_path / "all.usd")) == 5
 
 
 def test_export_per_object_names_files_of_earlier_exports(run_command, folder, tmp_path):

@@ -115,6 +115,7 @@ def export(options: argparse.Namespace, reporter: StoppingReporter) -> None:
 def _format(options: argparse.Namespace) -> str:
     """Return the name of the format, which is also the suffix of its files; raises InputError for unknown suffixes."""
     suffix = options.out.suffix[1:].lower()
+    suffix = "usdc" if suffix == "usd" else suffix  # A .usd may be of either kind.
     if options.format or options.per_object or not suffix:
         return options.format or "ply"
     if suffix not in _FORMATS:
