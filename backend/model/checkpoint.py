@@ -122,7 +122,7 @@ def save_checkpoint(
             file.flush()
             if keep_current and (folder / CURRENT).exists():
                 os.fsync(file.fileno())
-                replace_file(folder / CURRENT, folder / PREVIOUS)
+                _keep_current(folder)
     except OSError as error:
         advice = (
             "free some space" if is_lack_of_space(error) else "close programs that use it, or check its permissions,"
@@ -131,6 +131,16 @@ def save_checkpoint(
             f"The checkpoint {folder / CURRENT} could not be written ({error.strerror}); {advice} and run the same "
             "command again to continue from the previous checkpoint."
         ) from error
+
+
+def _keep_current(folder: Path) -> None:
+    """Make the current checkpoint the previous one, too, so that neither is missing until it is replaced."""
+    try:
+        (folder / PREVIOUS).unlink(missing_ok=True)
+        os.link(folder / CURRENT, folder / PREVIOUS)
+    except OSError:
+        # File systems such as exFAT have no hard links.
+        replace_file(folder / CURRENT, folder / PREVIOUS)
 
 
 def _write(file: BinaryIO, tensors: dict[str, np.ndarray], metadata: dict[str, str]) -> None:

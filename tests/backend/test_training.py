@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -32,6 +33,7 @@ from backend.raster import Camera, rasterize
 from backend.shared.class_table import ClassTable
 from backend.shared.errors import Cancelled, InputError
 from backend.shared.events import Reporter
+from backend.shared.formats import atomic
 from backend.shared.splats.blending import EPS_2D, USUAL_EPS_2D
 from backend.shared.stopping import StopRequest
 from backend.training.budget import Budget
@@ -459,6 +461,35 @@ def test_model_is_not_read_from_a_checkpoint_with_damaged_moments(tiny, tmp_path
         load_model(tmp_path)
 
 
+@pytest.mark.parametrize("has_links", [True, False])
+def test_process_killed_while_it_saves_leaves_a_complete_checkpoint(tmp_path, monkeypatch, has_links):
+    """With hard links, the current one is never missing; other commands refuse to work without it."""
+    steps = []
+
+    def watched(module, name):
+        whole = getattr(module, name)
+
+        def call(*args, **options):
+            assert (tmp_path / CURRENT).exists() or not has_links
+            steps.append(load_checkpoint(tmp_path)[1]["step"])
+            if name == "link" and not has_links:
+                raise OSError(95, "Operation not supported")
+            return whole(*args, **options)
+
+        monkeypatch.setattr(module, name, call)
+
+    save_checkpoint(tmp_path, {"x": np.zeros(3)}, {"step": 1})
+    for module, name in ((os, "fsync"), (os, "link"), (Path, "replace"), (Path, "unlink")):
+        watched(module, name)
+    for step in (2, 3):
+        save_checkpoint(tmp_path, {"x": np.zeros(3)}, {"step": step})
+    assert steps == sorted(steps) and set(steps) == {1, 2} and len(steps) >= 2 * 4
+    assert load_checkpoint(tmp_path)[1]["step"] == 3
+    (tmp_path / CURRENT).unlink()
+    assert load_checkpoint(tmp_path)[1]["step"] == 2
+    assert [path.name for path in tmp_path.iterdir()] == [PREVIOUS]
+
+
 def test_full_disk_keeps_previous_checkpoint(tmp_path, monkeypatch):
     save_checkpoint(tmp_path, {"x": np.zeros(3)}, {"step": 1})
 
@@ -573,7 +604,7 @@ def test_one_checkpoint_at_an_interval_may_fail(tiny, tmp_path, monkeypatch, fai
 
     def replace(part, path):
         saved.append(trainer.progress.step)
-        if path.name == PREVIOUS and len(saved) in (4, 4 + failing - 1):
+        if len(saved) in (5, 5 + failing - 1):
             raise PermissionError(13, "It is being used by another process")
         part.replace(path)
 
@@ -581,7 +612,7 @@ def test_one_checkpoint_at_an_interval_may_fail(tiny, tmp_path, monkeypatch, fai
         trainer.progress.step += 1
         return torch.tensor(1.0)
 
-    monkeypatch.setattr(checkpoint, "replace_file", replace)
+    monkeypatch.setattr(atomic, "replace_file", replace)
     monkeypatch.setattr(trainer, "step", step)
     monkeypatch.setattr(checkpoint, "seconds_to_next", lambda *_: 0.0)
     reporter.warning = warnings.append
