@@ -2,7 +2,8 @@
 
 For each vertex, several positions along its normal are tested. A patch around it is sampled from the photos that show
 it best; at the correct position they agree. The offsets are averaged over neighbors, weighted by their confidence,
-which also moves vertices in areas without texture.
+which also moves vertices in areas without texture. Each vertex then takes the median of the offsets around it, as a few
+patches agree at wrong positions.
 """
 
 from __future__ import annotations
@@ -21,26 +22,31 @@ from .surface import Surface, neighbors, vertex_normals, without_folds
 from .texture.photos import Photo, Photos, look
 from .views import Views
 
-_REACHES = (1.5, 1.0)
-"""Largest offset of a vertex in each round, in pixel sizes on the surface."""
+_ROUNDS = ((4.0, 17), (1.5, 9), (1.0, 9))
+"""Largest offset of a vertex in each round, in pixel sizes on the surface, and number of positions that are tested."""
 
 _PHOTOS = 6
-_SAMPLES = 9
 _PATCH = 5
-"""Number of tested positions, over twice the reach; number of rows and columns of a patch, one pixel apart."""
+"""Number of photos of a patch; number of its rows and columns, one pixel apart."""
 
 _OUTSIDE = 1.0
 """Clearance in pixels up to which a pixel may show something other than the surface."""
 
-_AT_ONCE = 50_000
-"""Number of vertices whose patches are sampled together."""
+_AT_ONCE = 450_000
+"""Number of positions whose patches are sampled together."""
 
 _NONE = 255
 _NOISE = (2.5 / 255) ** 2
 _STIFFNESS = 3.0
 _DAMPING = 0.05
-_SHARED = 3
+_SHARED = 1
 """Number of rounds in which the costs of patches are averaged over neighbors."""
+
+_AROUND = 3.0
+"""Distance in pixel sizes up to which vertices are among those whose median offset a vertex takes."""
+_MOST_AROUND = 128
+_BLOCK = 2048
+"""Largest number of vertices in a median; number of vertices whose medians are computed one after another."""
 
 
 def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Reporter | None = None) -> Surface:
@@ -56,14 +62,16 @@ def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Rep
         The surface with moved vertices and the same faces.
     """
     reporter = reporter or Reporter()
-    for step, reach in enumerate(_REACHES):
-        surface = replace(surface, vertices=_moved(surface, views, classes, reach, reporter, step))
+    for step, (reach, samples) in enumerate(_ROUNDS):
+        offsets = np.linspace(-reach, reach, samples)
+        surface = replace(surface, vertices=_moved(surface, views, classes, offsets, reporter, step))
     return surface
 
 
 def _moved(
-    surface: Surface, views: Views, classes: Sequence[int], reach: float, reporter: Reporter, step: int
+    surface: Surface, views: Views, classes: Sequence[int], offsets: np.ndarray, reporter: Reporter, step: int
 ) -> np.ndarray:
+    """Return the vertices of a surface, moved to the best of `offsets` (P,) in pixel sizes."""
     photos = Photos(views, surface.vertices, surface.faces, classes)
     vertices, faces = photos.vertices, photos.faces
     near = neighbors(vertices, faces)
@@ -76,10 +84,11 @@ def _moved(
     score = np.zeros((count, _PHOTOS), np.float32)
     chosen = np.full((count, _PHOTOS), -1, np.int32)
     size = np.zeros(count)
-    blocks = [slice(first, first + _AT_ONCE) for first in range(0, count, _AT_ONCE)]
-    rounds = 1 + len(blocks)
-    total = rounds * len(views.indices) * len(_REACHES)
-    done = rounds * len(views.indices) * step
+    at_once = _AT_ONCE // len(offsets)
+    blocks = [slice(first, first + at_once) for first in range(0, count, at_once)]
+    total = (1 + len(blocks)) * len(views.indices)
+    done = total * step
+    total *= len(_ROUNDS)
     for index in views.indices:
         reporter.progress(done, total)
         done += 1
@@ -88,10 +97,9 @@ def _moved(
             _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen, size)
     known = size > 0
     pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
-    offsets = np.linspace(-reach, reach, _SAMPLES)
-    cost = np.empty((count, _SAMPLES))
+    cost = np.empty((count, len(offsets)))
     for block in blocks:
-        patches = np.full((len(cost[block]), _PHOTOS, _SAMPLES, _PATCH * _PATCH, 3), _NONE, np.uint8)
+        patches = np.full((len(cost[block]), _PHOTOS, len(offsets), _PATCH * _PATCH, 3), _NONE, np.uint8)
         for index in views.indices:
             reporter.progress(done, total)
             done += 1
@@ -104,7 +112,9 @@ def _moved(
                 photo.planes, (photo.x, photo.y), patches,
             )  # fmt: skip
         _disagreement(patches, cost[block])
-    displacement = (_settled(cost, offsets, near) * pixel)[:, None] * normals
+    settled = np.empty(count)
+    _medians(_settled(cost, offsets, near), vertices, _AROUND * pixel, near.indptr, near.indices, settled)
+    displacement = (settled * pixel)[:, None] * normals
     return vertices + without_folds(vertices, faces, displacement)
 
 
@@ -138,6 +148,36 @@ def _settled(cost: np.ndarray, offsets: np.ndarray, near: csr_matrix) -> np.ndar
     system = diags(diagonal) - _STIFFNESS * near
     solved, _ = cg(system, ties * sure * wanted, rtol=1e-4, maxiter=300, M=diags(1 / diagonal))
     return np.clip(solved, offsets[0], offsets[-1])
+
+
+@kernel(parallel=True)
+def _medians(values, vertices, reach, starts, others, medians):
+    """Write to medians (V,) those of the values (V,) within `reach` (V,) of each vertex, along the surface.
+
+    starts (V + 1,), others: the vertices to which edges lead from vertex n are others[starts[n]:starts[n + 1]].
+    """
+    count = vertices.shape[0]
+    for block in prange((count + _BLOCK - 1) // _BLOCK):
+        seen_by = np.full(count, -1, np.int32)
+        around = np.empty(_MOST_AROUND, np.int32)
+        for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            around[0] = n
+            seen_by[n] = n
+            found, at = 1, 0
+            while at < found:
+                for edge in range(starts[around[at]], starts[around[at] + 1]):
+                    other = others[edge]
+                    if seen_by[other] == n or found == _MOST_AROUND:
+                        continue
+                    seen_by[other] = n
+                    square = 0.0
+                    for axis in range(3):
+                        square += (vertices[other, axis] - vertices[n, axis]) ** 2
+                    if square <= reach[n] ** 2:
+                        around[found] = other
+                        found += 1
+                at += 1
+            medians[n] = np.median(values[around[:found]])
 
 
 @kernel(parallel=True)

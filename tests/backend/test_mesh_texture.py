@@ -10,9 +10,10 @@ import torch
 import trimesh
 
 from backend.commands.objects.mesh import _unwrapped
+from backend.mesh import refine as refinement
 from backend.mesh.refine import refine
 from backend.mesh.smooth import smooth
-from backend.mesh.surface import Surface
+from backend.mesh.surface import Surface, neighbors
 from backend.mesh.texture.atlas import fill, find_texels
 from backend.mesh.texture.bake import bake_texture, texture_size
 from backend.mesh.texture.unwrap import unwrap
@@ -378,12 +379,13 @@ def test_unseen_texels_get_splat_colors_and_baking_stops():
         bake_texture(surface, uvs, 64, views, [1], Stopping())
 
 
-def test_refinement_moves_surface_to_photo_consistency():
+@pytest.mark.parametrize("pixels_off", [0.8, 3.0])
+def test_refinement_moves_surface_to_photo_consistency(pixels_off):
     mesh = trimesh.creation.icosphere(4, 1.0)
     views = StubViews(mesh, below=True)
     surface = surface_of(mesh)
     pixel = 4 / views.cameras[0].K[0, 0]
-    bumps = 1 - pixel * (0.8 + 0.5 * np.sin(mesh.vertices @ [7, 2, 3]))
+    bumps = 1 - pixel * (pixels_off + 0.5 * np.sin(mesh.vertices @ [7, 2, 3]))
     surface.vertices = mesh.vertices * bumps[:, None]
     refined = refine(surface, views, [1])
     np.testing.assert_array_equal(refined.faces, surface.faces)
@@ -392,6 +394,24 @@ def test_refinement_moves_surface_to_photo_consistency():
     assert np.median(after) < 0.25 * np.median(before) and after.max() < before.max()
     a, b, c = np.moveaxis(refined.vertices[refined.faces], 1, 0)
     assert ((np.cross(b - a, c - a) * (a + b + c)).sum(1) > 0).all()  # nothing folded
+
+
+def test_median_is_that_of_vertices_around_on_the_same_wall():
+    """The other side of a thin plate is nearer than the radius, but not along the surface within it."""
+    rows = np.stack(np.meshgrid(np.arange(60), np.arange(40), indexing="ij"), -1).reshape(-1, 2)
+    corners = np.concatenate([np.c_[rows, np.full(len(rows), z)] for z in (0.0, 0.1)])
+    at = np.arange(len(rows)).reshape(60, 40)
+    half = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:]], -1).reshape(-1, 3)
+    faces = np.concatenate([half, half[:, ::-1] + len(rows)])
+    near = neighbors(corners, faces)
+    values = np.random.default_rng(2).normal(size=len(corners)) + np.where(corners[:, 2] > 0, 100.0, 0.0)
+    reach = np.where(corners[:, 0] < 30, 1.5, 3.0)
+    found = np.empty(len(corners))
+    refinement._medians(values, corners, reach, near.indptr, near.indices, found)
+    for n in (0, 45, 1234, 1790, len(rows) + 1234, len(corners) - 42):
+        same = corners[:, 2] == corners[n, 2]
+        inside = same & (np.linalg.norm(corners - corners[n], axis=1) <= reach[n])
+        assert found[n] == np.median(values[inside]), n
 
 
 def test_refinement_keeps_surface_without_texture():
