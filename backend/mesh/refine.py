@@ -22,8 +22,11 @@ from .surface import Surface, neighbors, vertex_normals, without_folds
 from .texture.photos import Photo, Photos, look
 from .views import Views
 
-_ROUNDS = ((4.0, 17), (1.5, 9), (1.0, 9))
+_ROUNDS = ((2.5, 11), (1.5, 9), (1.0, 9))
 """Largest offset of a vertex in each round, in pixel sizes on the surface, and number of positions that are tested."""
+
+_OF_EXTENT = 1 / 36
+"""Largest offset, relative to the diagonal of the surface's bounding box: small pictures show few details to match."""
 
 _PHOTOS = 6
 _PATCH = 5
@@ -97,6 +100,8 @@ def _moved(
             _choose(vertices, normals, index, *_seen_by(photo), photo.safe, score, chosen, size)
     known = size > 0
     pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
+    extent = np.linalg.norm(np.ptp(vertices, axis=0)) / max(float(np.median(pixel)), 1e-30)
+    offsets = offsets * min(1.0, _OF_EXTENT * extent / offsets[-1])
     cost = np.empty((count, len(offsets)))
     for block in blocks:
         patches = np.full((len(cost[block]), _PHOTOS, len(offsets), _PATCH * _PATCH, 3), _NONE, np.uint8)
