@@ -26,7 +26,9 @@ _ROUNDS = ((2.5, 11), (1.5, 9), (1.0, 9))
 """Largest offset of a vertex in each round, in pixel sizes on the surface, and number of positions that are tested."""
 
 _OF_EXTENT = 1 / 36
-"""Largest offset, relative to the diagonal of the surface's bounding box: small pictures show few details to match."""
+_LEAST = 0.1
+"""Largest offset, relative to the diagonal of the surface's bounding box, as small pictures show few details to match,
+but at least so many pixel sizes."""
 
 _PHOTOS = 6
 _PATCH = 5
@@ -64,17 +66,17 @@ def refine(surface: Surface, views: Views, classes: Sequence[int], reporter: Rep
     Returns:
         The surface with moved vertices and the same faces.
     """
+    if not len(surface.faces):
+        return surface
     reporter = reporter or Reporter()
-    for step, (reach, samples) in enumerate(_ROUNDS):
-        offsets = np.linspace(-reach, reach, samples)
-        surface = replace(surface, vertices=_moved(surface, views, classes, offsets, reporter, step))
+    for step in range(len(_ROUNDS)):
+        surface = replace(surface, vertices=_moved(surface, views, classes, reporter, step))
     return surface
 
 
-def _moved(
-    surface: Surface, views: Views, classes: Sequence[int], offsets: np.ndarray, reporter: Reporter, step: int
-) -> np.ndarray:
-    """Return the vertices of a surface, moved to the best of `offsets` (P,) in pixel sizes."""
+def _moved(surface: Surface, views: Views, classes: Sequence[int], reporter: Reporter, step: int) -> np.ndarray:
+    """Return the vertices of a surface after a round of refinement."""
+    most, samples = _ROUNDS[step]
     photos = Photos(views, surface.vertices, surface.faces, classes)
     vertices, faces = photos.vertices, photos.faces
     near = neighbors(vertices, faces)
@@ -87,11 +89,10 @@ def _moved(
     score = np.zeros((count, _PHOTOS), np.float32)
     chosen = np.full((count, _PHOTOS), -1, np.int32)
     size = np.zeros(count)
-    at_once = _AT_ONCE // len(offsets)
+    at_once = _AT_ONCE // samples
     blocks = [slice(first, first + at_once) for first in range(0, count, at_once)]
-    total = (1 + len(blocks)) * len(views.indices)
-    done = total * step
-    total *= len(_ROUNDS)
+    of_round = (1 + len(blocks)) * len(views.indices)
+    done, total = of_round * step, of_round * len(_ROUNDS)
     for index in views.indices:
         reporter.progress(done, total)
         done += 1
@@ -101,10 +102,11 @@ def _moved(
     known = size > 0
     pixel = np.where(known, size, np.median(size[known]) if known.any() else 0.0)
     extent = np.linalg.norm(np.ptp(vertices, axis=0)) / max(float(np.median(pixel)), 1e-30)
-    offsets = offsets * min(1.0, _OF_EXTENT * extent / offsets[-1])
-    cost = np.empty((count, len(offsets)))
+    reach = min(most, max(float(_OF_EXTENT * extent), _LEAST))
+    offsets = np.linspace(-reach, reach, samples)
+    cost = np.empty((count, samples))
     for block in blocks:
-        patches = np.full((len(cost[block]), _PHOTOS, len(offsets), _PATCH * _PATCH, 3), _NONE, np.uint8)
+        patches = np.full((len(cost[block]), _PHOTOS, samples, _PATCH * _PATCH, 3), _NONE, np.uint8)
         for index in views.indices:
             reporter.progress(done, total)
             done += 1

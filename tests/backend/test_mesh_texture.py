@@ -429,6 +429,17 @@ def test_refinement_keeps_surface_without_texture():
     np.testing.assert_allclose(refine(surface, views, [1]).vertices, mesh.vertices, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_refinement_of_almost_nothing_is_finite(size):
+    views = StubViews(trimesh.creation.icosphere(2, 1.0))
+    vertices = 0.3 + size * np.eye(3)
+    refined = refine(Surface(vertices, np.array([[0, 1, 2]], np.int32), np.zeros(1, bool)), views, [1])
+    assert np.abs(refined.vertices - vertices).max() < 3 * 4 / views.cameras[0].K[0, 0]
+    empty = Surface(np.zeros((0, 3)), np.zeros((0, 3), np.int32), np.zeros(0, bool))
+    assert refine(empty, views, [1]) is empty
+
+
 def face_normals(vertices, faces):
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     across = np.cross(b - a, c - a)
