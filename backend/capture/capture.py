@@ -44,6 +44,10 @@ class View:
     height: int
     camera_id: int
 
+    def to_camera(self, xyz: np.ndarray) -> np.ndarray:
+        """Return positions (n, 3) in world units in camera space."""
+        return xyz @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+
     def pixels_of(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Project positions or directions (n, 3) in camera space: indices of those in the image, columns and rows."""
         x, y, z = xyz.T

@@ -78,7 +78,7 @@ def _observe(
         view = capture.views[index]
         observed = np.unique(capture.observed(index))
         observed = observed[np.argsort(order[observed])]
-        local = xyz[observed] @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        local = view.to_camera(xyz[observed])
         inside, x, y = (each[:_POINTS] for each in view.pixels_of(local))
         energies = _energies(capture.image(index))[y, x] if len(inside) else np.zeros((0, 4))
         size = np.log(view.K[0, 0] / local[inside, 2])

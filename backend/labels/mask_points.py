@@ -169,7 +169,7 @@ def _agreement(capture: Capture, masks: _Masks, object_id: int, xyz: np.ndarray)
     inside, agreeing = np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.int64)
     for index, shown in masks.shown[object_id].items():
         view = capture.views[index]
-        found, columns, rows = view.pixels_of(xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
+        found, columns, rows = view.pixels_of(view.to_camera(xyz))
         known = masks.knows(index, rows, columns)
         found, columns, rows = found[known], columns[known], rows[known]
         inside[found] += 1

@@ -72,7 +72,7 @@ def _agreement_of(capture: Capture, views: Sequence[int], place: int) -> float |
     observed = capture.observed(index)
     xyz = capture.points.xyz[observed] if len(observed) >= _FEWEST // 5 else capture.points.xyz
     xyz = xyz[:: max(len(xyz) // _MOST_POINTS, 1)]
-    positions = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    positions = view.to_camera(xyz)
     inside, _, _ = view.pixels_of(positions)
     positions = positions[inside]
     if len(positions) < _FEWEST // 5:
@@ -119,7 +119,7 @@ def _nearest(capture: Capture, views: Sequence[int], place: int, depth: float) -
 def _colors_at(capture: Capture, index: int, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the colors (n, 3) that a photo shows at positions (n, 3), and which of them are inside it."""
     view, (photo, K) = capture.views[index], _scaled(capture, index)
-    shown = (xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]) @ K.T
+    shown = view.to_camera(xyz) @ K.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         x, y = (shown[:, :2] / shown[:, 2:]).T - 0.5
         visible = (shown[:, 2] > 0) & (x >= 0) & (y >= 0) & (x <= photo.shape[1] - 1) & (y <= photo.shape[0] - 1)

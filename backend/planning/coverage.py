@@ -37,7 +37,7 @@ _FEW_POINTS = 2000
 _TOGETHER = 8192
 """Largest number of points near each other whose views are found together."""
 
-_CELLS = 40
+CELLS = 40
 """Number of cells along the longer side of a view in which points are counted."""
 
 
@@ -255,18 +255,24 @@ def vacancy(capture: Capture, check: Check = proceed) -> float:
 
 def occupied_cells(view: View, xyz: np.ndarray) -> np.ndarray:
     """Return the cells of a view with any of the points (n, 3) in them: (rows, columns) bool."""
-    cell = max(view.width, view.height) / _CELLS
+    cell = max(view.width, view.height) / CELLS
     rows, columns = max(round(view.height / cell), 1), max(round(view.width / cell), 1)
     occupied = np.zeros((rows, columns), np.bool_)
-    _, x, y = view.pixels_of(xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3])
-    occupied[y * rows // view.height, x * columns // view.width] = True
+    _, y, x = cells_of(view, view.to_camera(xyz), occupied.shape)
+    occupied[y, x] = True
     return occupied
+
+
+def cells_of(view: View, local: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which of the positions (n, 3) in camera space are in a view, and the rows and columns of their cells."""
+    inside, x, y = view.pixels_of(local)
+    return inside, y * shape[0] // view.height, x * shape[1] // view.width
 
 
 def _inside(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:
     """Return which of the points xyz (n, 3) are inside a view or near its border: (n,) bool."""
     view = capture.views[index]
-    x, y, z = (xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
+    x, y, z = view.to_camera(xyz).T
     across, down = MARGIN * view.width, MARGIN * view.height
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         u = x / z * view.K[0, 0] + view.K[0, 2]

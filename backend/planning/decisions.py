@@ -29,7 +29,11 @@ from .coverage import (
     views_like_held_out,
     views_without_objects,
 )
+from .plane_points import LEAST as LEAST_ON_PLANES
+from .plane_points import PlanePoints, find_plane_points
 from .surroundings import LEAST, Surroundings, find_surroundings
+
+NO_POINTS = np.zeros((0, 3))
 
 PIXELS_TO_READ = 3e8
 """Largest total number of pixels of photos that are read for a plan, in a few seconds; larger captures are only read
@@ -88,7 +92,13 @@ class PlanningContext:
     @cached_property
     def surroundings(self) -> Surroundings:
         """The surroundings without points that the training views show."""
-        return find_surroundings(planned_capture(self.capture, self.plan), self.check)
+        more = self.plane_points.xyz if self.plan.does("plane-points") else NO_POINTS
+        return find_surroundings(planned_capture(self.capture, self.plan), more, self.check)
+
+    @cached_property
+    def plane_points(self) -> PlanePoints:
+        """The points on planes without features that the training views show."""
+        return find_plane_points(planned_capture(self.capture, self.plan), NO_POINTS, self.check)
 
     @property
     def labeled(self) -> bool:
@@ -178,6 +188,19 @@ def _groups(context: PlanningContext) -> Decision | None:
         return None
     why = f"the {len(into)} IDs are grouped into {len(into) - len(parts)} objects"
     return Decision("groups", f"separate meshes and names for {len(parts)} IDs", False, why, can_override=False)
+
+
+def _plane_points(context: PlanningContext) -> Decision | None:
+    what = "points on planes without features, such as a plain table"
+    if context.resumed is not None:
+        # The training has begun with or without them.
+        return context.resumed.planned("plane-points")
+    if not _may_read_photos(context):
+        return Decision("plane-points", what, None, "it requires reading all photos, which training does first")
+    found = context.plane_points
+    shown = f"{found.fraction:.1%} of the photos' area shows planes whose points are elsewhere"
+    why = f"{shown}; the threshold is {LEAST_ON_PLANES:.0%}"
+    return Decision("plane-points", what, found.fraction >= LEAST_ON_PLANES, why, can_override=len(found.xyz) > 0)
 
 
 def _surroundings(context: PlanningContext) -> Decision | None:
@@ -340,8 +363,14 @@ def _dense_points(context: PlanningContext) -> Decision | None:
         return context.resumed.planned("dense-points")
     if not _may_read_photos(context):
         return Decision("dense-points", what, None, "it requires reading all photos, which training does first")
-    vacant = vacancy(planned_capture(context.capture, context.plan), context.check)
-    vacant = max(vacant - context.surroundings.fraction, 0.0)
+    capture = planned_capture(context.capture, context.plan)
+    # Points on planes are no reason to look for none there, since they are less exact.
+    sky = (
+        find_surroundings(capture, NO_POINTS, context.check)
+        if context.plan.does("plane-points")
+        else context.surroundings
+    )
+    vacant = max(vacancy(capture, context.check) - sky.fraction, 0.0)
     why = f"{vacant:.0%} of the photos' area, without the sky, has no points; the threshold is {VACANT:.0%}"
     return Decision("dense-points", what, vacant >= VACANT, why)
 
@@ -382,9 +411,9 @@ def _surface(context: PlanningContext) -> Decision | None:
 
 
 DECISIONS: tuple[Callable[[PlanningContext], Decision | None], ...] = (
-    _votes, _objects, _groups, _surroundings, _rest, _labels, _undistortion, _duplicate_views, _blind_views,
-    _blurred_views, _other_views, _validation_views, _unseen_points, _dense_points, _exposure, _pyramid, _meshes,
-    _surface,
+    _votes, _objects, _groups, _plane_points, _surroundings, _rest, _labels, _undistortion, _duplicate_views,
+    _blind_views, _blurred_views, _other_views, _validation_views, _unseen_points, _dense_points, _exposure,
+    _pyramid, _meshes, _surface,
 )  # fmt: skip
 """In the order of `KEYS`; a decision may depend on earlier ones. None if a decision does not apply to the capture."""
 

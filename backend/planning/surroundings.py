@@ -52,11 +52,12 @@ class Surroundings(NamedTuple):
     uniform: bool
 
 
-def find_surroundings(capture: Capture, check: Check = proceed) -> Surroundings:
+def find_surroundings(capture: Capture, more: np.ndarray, check: Check = proceed) -> Surroundings:
     """Find the directions in which the training views of a capture show surroundings without points.
 
     Args:
         capture: the capture; must be prepared.
+        more: (n, 3) further points of surfaces, in world units.
         check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
@@ -65,7 +66,7 @@ def find_surroundings(capture: Capture, check: Check = proceed) -> Surroundings:
     Raises:
         InputError: an image or a mask cannot be read.
     """
-    train = list(capture.train_indices)
+    train, xyz = list(capture.train_indices), np.concatenate([capture.points.xyz, more])
     views = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _VIEWS)).astype(int))]
     directions = _sphere(SPACING)
     inside, vacant = np.zeros(len(directions), np.int64), np.zeros(len(directions), np.int64)
@@ -73,7 +74,7 @@ def find_surroundings(capture: Capture, check: Check = proceed) -> Surroundings:
     shown = []
     for index in views:
         check()
-        view, free = capture.views[index], _vacant_cells(capture, index)
+        view, free = capture.views[index], _vacant_cells(capture, index, xyz)
         seen, x, y = view.pixels_of(directions @ view.viewmat[:3, :3].T)
         here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]
         inside[seen] += 1
@@ -104,10 +105,10 @@ def _sphere(spacing: float) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
 
 
-def _vacant_cells(capture: Capture, index: int) -> np.ndarray:
-    """Return the cells of a view without points in or beside them, and without objects: (rows, columns) bool."""
+def _vacant_cells(capture: Capture, index: int, xyz: np.ndarray) -> np.ndarray:
+    """Return the cells of a view without points (n, 3) in or beside them, and without objects: (rows, columns) bool."""
     view = capture.views[index]
-    occupied = ndimage.binary_dilation(occupied_cells(view, capture.points.xyz), np.ones((3, 3), np.bool_))
+    occupied = ndimage.binary_dilation(occupied_cells(view, xyz), np.ones((3, 3), np.bool_))
     rows, columns = occupied.shape
     mask = capture.mask(index)
     if mask is not None:

@@ -80,6 +80,15 @@ def find_planes(xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> 
     return found
 
 
+def on_plane(plane: ScenePlane, xyz: np.ndarray, normals: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Return which points (n,) bool are on a plane and not far beyond those that it was found from.
+
+    The other arguments are those of `find_planes`.
+    """
+    inside = _inside(xyz, normals, distances, plane.normal, plane.offset)
+    return inside & (np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach)
+
+
 def sides_of_planes(
     xyz: np.ndarray,
     normals: np.ndarray,
@@ -104,8 +113,7 @@ def sides_of_planes(
     found, taken = np.zeros(len(first), np.int8), np.zeros(len(xyz), np.bool_)
     is_bent = (normals[first] * normals[second]).sum(1) < _ALIKE
     for plane in find_planes(xyz, normals, distances):
-        on = _inside(xyz, normals, distances, plane.normal, plane.offset) & ~taken
-        on &= np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach
+        on = on_plane(plane, xyz, normals, distances) & ~taken
         side = np.sign(normals[on].sum(0) @ plane.normal)
         # The lower side of a thing is not the plane that it lies on.
         on &= side * (normals @ plane.normal) > 0

@@ -45,7 +45,7 @@ def pixel_size(capture: Capture, check: Check = proceed) -> float:
     for index in np.unique(np.linspace(0, len(capture.views) - 1, min(len(capture.views), _VIEWS)).astype(int)):
         check()
         view = capture.views[index]
-        local = xyz @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+        local = view.to_camera(xyz)
         sizes.append(local[view.pixels_of(local)[0], 2] / view.K[0, 0])
     together = np.concatenate(sizes) if sizes else np.zeros(0)
     return float(np.median(together)) if len(together) else np.inf

@@ -101,6 +101,30 @@ def test_points_are_looked_for_where_photos_have_none(write_capture, tmp_path):
     assert decide(PlanningContext(many, Choices(), resumed=begun))["dense-points"].done, "as the training began"
 
 
+def test_planes_without_features_get_points(write_capture, tmp_path, run_command):
+    """Points on the edges of a plain floor below the spheres; the plan says how much of the photos it fills."""
+    scene = write_capture(views=9, size=(64, 48), points=200, masks=False)
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, 150)
+    edge = np.column_stack([2 * np.cos(angle), np.full(150, 1.2), 2 * np.sin(angle)]) + rng.normal(0, 0.005, (150, 3))
+    scene.xyz, scene.rgb = np.concatenate([scene.xyz, edge]), np.concatenate([scene.rgb, np.zeros((150, 3), np.uint8)])
+    write_capture.write_model(scene, scene.folder / "sparse/0", ".bin")
+    capture = loaded(scene, tmp_path)
+    found = planned(capture)["plane-points"]
+    assert found.done and found.can_override and "shows planes" in found.why
+    assert not planned(capture, leave_out=["plane-points"])["plane-points"].done
+    begun = Plan((Decision("plane-points", "", False, ""),))
+    assert not decide(PlanningContext(capture, Choices(), resumed=begun))["plane-points"].done, "as the training began"
+    assert decide(PlanningContext(capture, Choices(), resumed=Plan()))["plane-points"] is None, "of a former version"
+    said = {}
+    for name, words in (("with", ()), ("without", ("--leave-out", "plane-points"))):
+        result = run_command("train", scene.folder, "--out", tmp_path / name, "--steps", 1, *SMALL, *words)
+        assert result.code == 0, result
+        said[name] = result.out
+    assert "points added on planes without features" in said["with"]
+    assert "points added on planes without features" not in said["without"]
+
+
 # --- basis of decisions ----------------------------------------------------------------------------------------------
 
 
@@ -109,8 +133,8 @@ def test_plan_of_capture_with_objects(write_capture, tmp_path):
     plan = planned(loaded(scene, tmp_path), point_ids=scene.point_objects, thorough=True)
     done = {own.key: own.done for own in plan.decisions}
     assert done == {
-        "votes": True, "surroundings": False, "rest": False, "labels": True, "undistortion": False,
-        "dense-points": True, "exposure": True, "pyramid": False,
+        "votes": True, "plane-points": False, "surroundings": False, "rest": False, "labels": True,
+        "undistortion": False, "dense-points": True, "exposure": True, "pyramid": False,
     }  # fmt: skip
     assert len(DECISIONS) == len(KEYS) and list(done) == [key for key in KEYS if key in done]
     assert planned_settings(Settings(), plan) == Settings(fit_colors=True)

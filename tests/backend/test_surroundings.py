@@ -18,6 +18,8 @@ from backend.training.initial_model import DistantPoints
 from backend.training.settings import Settings
 from backend.training.trainer import Trainer
 
+NONE = np.zeros((0, 3))
+
 
 def shade(directions: np.ndarray) -> np.ndarray:
     """Return the color (..., 3) of a sky in these directions, 0 .. 255."""
@@ -49,7 +51,7 @@ def plan_of(capture, scene, **choices):
 @pytest.mark.parametrize("masks", [True, False])
 def test_surroundings_are_where_no_points_are(outdoors, masks):
     capture, scene = outdoors(masks=masks)
-    found = find_surroundings(capture)
+    found = find_surroundings(capture, NONE)
     unlabeled = np.mean([(ids == 0).mean() for ids in scene.ids])
     assert 0.5 * unlabeled < found.fraction < unlabeled, "those beside the spheres, without a margin"
     center, radius = extent_of(capture)
@@ -76,13 +78,14 @@ def test_plan_gives_surroundings_splats_unless_they_have_one_color(outdoors):
 def test_covered_photos_have_no_surroundings(outdoors):
     capture, scene = outdoors(spheres=[(3, np.zeros(3), 3.0)])
     plan = plan_of(capture, scene)
-    assert find_surroundings(capture).fraction == 0 and not len(find_surroundings(capture).xyz)
+    found = find_surroundings(capture, NONE)
+    assert found.fraction == 0 and not len(found.xyz)
     assert not plan["surroundings"].done and not plan["surroundings"].can_override and not plan["rest"].done
 
 
 def test_training_starts_with_distant_anchors_of_no_object(outdoors):
     capture, scene = outdoors()
-    found = find_surroundings(capture)
+    found = find_surroundings(capture, NONE)
     far = DistantPoints(*found[:3])
     without, model = (
         Trainer.start(capture, scene.point_objects, Settings(offsets=2), surroundings=given).model
@@ -101,7 +104,7 @@ def test_training_starts_with_distant_anchors_of_no_object(outdoors):
 @pytest.mark.long
 def test_distant_splats_make_held_out_skies_better(outdoors):
     capture, scene = outdoors()
-    far = DistantPoints(*find_surroundings(capture)[:3])
+    far = DistantPoints(*find_surroundings(capture, NONE)[:3])
     errors = []
     for given in (None, far):
         trainer = Trainer.start(
@@ -122,7 +125,7 @@ def sky_error(model: ObjectModel, scene, index: int, sky: np.ndarray) -> float:
 
 def test_no_mesh_is_made_of_surroundings(outdoors):
     capture, scene = outdoors()
-    far = DistantPoints(*find_surroundings(capture)[:3])
+    far = DistantPoints(*find_surroundings(capture, NONE)[:3])
     trainer = Trainer.start(capture, scene.point_objects, Settings(offsets=2), surroundings=far)
     views = Views(trainer.model, trainer.scene, capture.train_indices)
     views._turn_to(range(len(trainer.model.classes)))

@@ -10,6 +10,7 @@ from ...capture import Capture
 from ...labels import vote
 from ...labels.mask_points import MaskPoints, place_points
 from ...planning.coverage import unseen_points
+from ...planning.plane_points import LEAST, PlanePoints, find_plane_points
 from ...shared.events import Reporter
 from ...shared.reconstruction.plan import Plan
 from ...shared.stopping import StoppingReporter
@@ -42,7 +43,12 @@ class StartingPoints(NamedTuple):
 
 
 def starting_points(
-    capture: Capture, point_ids: np.ndarray, plan: Plan, seed: int, reporter: StoppingReporter
+    capture: Capture,
+    point_ids: np.ndarray,
+    plan: Plan,
+    on_planes: PlanePoints | None,
+    seed: int,
+    reporter: StoppingReporter,
 ) -> StartingPoints:
     """Choose and complete a capture's points as its plan decides.
 
@@ -50,6 +56,8 @@ def starting_points(
         capture: the capture that is trained on.
         point_ids: (M,) int64 object ID of each of its points, 0 if it belongs to none.
         plan: the plan.
+        on_planes: points on planes without features, if the plan adds them; if it adds dense points, they are found anew
+            and left out where these suffice.
         seed: of random numbers.
         reporter: receives progress, how many points are placed, and the objects that stay without any.
 
@@ -61,6 +69,12 @@ def starting_points(
     if plan.does("dense-points"):
         dense, seeds = _dense(capture, seeds, reporter)
         parts.append(dense)
+        if on_planes is not None:
+            found = find_plane_points(capture, dense.xyz, reporter.check)
+            on_planes = found if found.fraction >= LEAST else None
+    if on_planes is not None:
+        parts.append(_voted(capture, on_planes.xyz, on_planes.rgb, reporter))
+        reporter.status(f"{len(on_planes.xyz):,} points added on planes without features")
     found_ids = np.concatenate([point_ids[seeds], *(part.ids for part in parts)])
     missing = np.setdiff1d(capture.object_ids, found_ids).tolist()
     if missing:
@@ -74,15 +88,20 @@ def _dense(capture: Capture, seeds: np.ndarray, reporter: StoppingReporter) -> t
     reporter.expect({DENSE: ("Preparing", _SECONDS * min(len(capture.train_indices), MOST_VIEWS))})
     reporter.begin(DENSE, "Finding points on surfaces without features")
     found = find_dense_points(capture, capture.train_indices, reporter.progress)
-    ids = np.zeros(len(found.xyz), np.int64)
-    if capture.has_masks and len(ids):
-        ids = vote(capture, positions=found.xyz, reporter=StoppingReporter(Reporter(), reporter.stop)).ids
     reporter.status(
         f"{len(found.xyz):,} points added on surfaces without features; {int(found.in_front.sum()):,} of the capture's "
         "left out, which float in front of surfaces"
     )
     kept = seeds & ~found.in_front
-    return MaskPoints(found.xyz, found.rgb, ids), kept if kept.any() else seeds
+    return _voted(capture, found.xyz, found.rgb, reporter), kept if kept.any() else seeds
+
+
+def _voted(capture: Capture, xyz: np.ndarray, rgb: np.ndarray, reporter: StoppingReporter) -> MaskPoints:
+    """Return points (n, 3) with the objects that masks show there."""
+    ids = np.zeros(len(xyz), np.int64)
+    if capture.has_masks and len(ids):
+        ids = vote(capture, positions=xyz, reporter=StoppingReporter(Reporter(), reporter.stop)).ids
+    return MaskPoints(xyz, rgb, ids)
 
 
 def _place(capture: Capture, missing: list[int], seed: int, reporter: Reporter) -> MaskPoints:

@@ -16,9 +16,9 @@ from ..errors import InputError
 from ..formats.json_file import read_json, write_json
 
 KEYS = (
-    "votes", "objects", "groups", "surroundings", "rest", "labels", "undistortion", "duplicate-views", "blind-views",
-    "blurred-views", "other-views", "validation-views", "unseen-points", "dense-points", "exposure", "pyramid",
-    "meshes", "surface",
+    "votes", "objects", "groups", "plane-points", "surroundings", "rest", "labels", "undistortion", "duplicate-views",
+    "blind-views", "blurred-views", "other-views", "validation-views", "unseen-points", "dense-points", "exposure",
+    "pyramid", "meshes", "surface",
 )  # fmt: skip
 """Keys of the decisions, in the order in which they are made."""
 
