@@ -69,7 +69,8 @@ def try_regions(graph: SplatGraph, progress: Callable[[int, int], object]) -> Me
             progress(len(CONCAVE_AND_COLOR) * done + number + 1, len(NEIGHBORS) * len(CONCAVE_AND_COLOR))
     agreeing /= len(NEIGHBORS) * len(CONCAVE_AND_COLOR)
     normal = measure_normals(graph.xyz[near[:, :_OF_PLANES]], graph.facing)
-    sides = sides_of_planes(graph.xyz, normal, graph.distances, graph.seen, (edges.first, edges.second))
+    pairs = edges.first, edges.second
+    sides = sides_of_planes(graph.xyz, normal, graph.distances, graph.seen, pairs, may_be_bent=True)
     agreeing = np.where(sides == 0, agreeing, sides > 0)
     return merge_tree(_symmetric(edges, agreeing, count), ones, 0.0)
 

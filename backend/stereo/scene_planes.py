@@ -19,6 +19,9 @@ _REACHED = 98
 _LARGE, _BEYOND = 0.03, 1.3
 """Size of the smallest large plane, as a fraction of all photos' pixels; and distance from its center up to which it
 goes on, relative to its reach."""
+_SPREAD, _THICKEST, _ALONG = 2.0, 0.02, 0.05
+"""Of planes that may be bent: standard deviations of their points within which these are on them, instead of `_NEAR`;
+largest such distance; and distance from the plane within which points with its normal tell the deviation."""
 _SAMPLE = 20_000
 _TRIALS = 300
 _ROUNDS = 3
@@ -85,8 +88,7 @@ def on_plane(plane: ScenePlane, xyz: np.ndarray, normals: np.ndarray, distances:
 
     The other arguments are those of `find_planes`.
     """
-    inside = _inside(xyz, normals, distances, plane.normal, plane.offset)
-    return inside & (np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach)
+    return _inside(xyz, normals, distances, plane.normal, plane.offset) & _within_reach(plane, xyz)
 
 
 def sides_of_planes(
@@ -95,6 +97,7 @@ def sides_of_planes(
     distances: np.ndarray,
     seen: np.ndarray,
     pairs: tuple[np.ndarray, np.ndarray],
+    may_be_bent: bool = False,
 ) -> np.ndarray:
     """Compare the two points of pairs with the large planes, such as the table that things stand on.
 
@@ -103,6 +106,8 @@ def sides_of_planes(
         normals: (n, 3) unit normals, towards the cameras.
         seen: (n,) pixels that each point covers in all photos.
         pairs: m points each.
+        may_be_bent: whether the planes may be a little bent, as surfaces that are reconstructed from photos; flat
+            things on them are part of them then.
 
     Returns:
         (m,) int8: 1 if both points are on one plane; -1 if one is on a plane and the other, with a different normal, is
@@ -113,14 +118,17 @@ def sides_of_planes(
     found, taken = np.zeros(len(first), np.int8), np.zeros(len(xyz), np.bool_)
     is_bent = (normals[first] * normals[second]).sum(1) < _ALIKE
     for plane in find_planes(xyz, normals, distances):
-        on = on_plane(plane, xyz, normals, distances) & ~taken
+        off = (xyz @ plane.normal - plane.offset) / distances
+        along = (np.abs(normals @ plane.normal) > _ALIKE) & _within_reach(plane, xyz)
+        middle, near = _middle_and_thickness(off[along & (np.abs(off) < _ALONG)]) if may_be_bent else (0.0, _NEAR)
+        on = along & (np.abs(off - middle) < near) & ~taken
         side = np.sign(normals[on].sum(0) @ plane.normal)
         # The lower side of a thing is not the plane that it lies on.
         on &= side * (normals @ plane.normal) > 0
         if seen[on].sum() < _LARGE * seen.sum():
             continue
         taken |= on
-        in_front = ~on & (side * (xyz @ plane.normal - plane.offset) > 0)
+        in_front = ~on & (side * (off - middle) > 0)
         found[((on[first] & in_front[second]) | (in_front[first] & on[second])) & is_bent] = -1
         found[on[first] & on[second]] = 1
     return found
@@ -131,3 +139,19 @@ def _inside(
 ) -> np.ndarray:
     """Return which points (n,) bool are on a plane."""
     return (np.abs(xyz @ normal - offset) < _NEAR * distances) & (np.abs(normals @ normal) > _ALIKE)
+
+
+def _within_reach(plane: ScenePlane, xyz: np.ndarray) -> np.ndarray:
+    """Return which points (n,) bool are not far beyond those that a plane was found from."""
+    return np.linalg.norm(xyz - plane.center, axis=1) < _BEYOND * plane.reach
+
+
+def _middle_and_thickness(off: np.ndarray) -> tuple[float, float]:
+    """Return what a plane is off its points, and the distance from there within which points are on it, both relative
+    to the distance from which they were seen, from the relative distances (m,) of points along it."""
+    if len(off):
+        middle = float(np.median(off))
+        near = _SPREAD * 1.4826 * float(np.median(np.abs(off - middle)))
+        if _NEAR < near < _THICKEST:
+            return middle, near
+    return 0.0, _NEAR

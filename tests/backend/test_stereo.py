@@ -166,6 +166,23 @@ def test_things_are_in_front_of_a_large_plane_or_behind_it(seen):
         normals[:600] *= -1
 
 
+@pytest.mark.parametrize(("bent", "on"), [(0.0, True), (0.06, True), (1.0, False)])
+def test_a_table_that_is_a_little_bent_is_one_plane(bent, on):
+    """Its edges are higher than its middle, as in reconstructions by inexact lenses; a bowl is no plane."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-1, 1, (2000, 2))
+    top = np.column_stack([flat, bent * (flat**2).sum(1) + rng.normal(0, 0.002, 2000)])
+    normals = np.column_stack([-2 * bent * flat, np.ones(2000)])
+    thing = np.column_stack([np.full(200, 0.5), rng.uniform(0.4, 0.6, 200), rng.uniform(0.1, 0.5, 200)])
+    xyz = np.concatenate([top, thing])
+    normals = np.concatenate([normals, np.tile([1.0, 0, 0], (200, 1))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middle, edge = np.argsort(np.linalg.norm(flat, axis=1))[[0, 1000]]
+    first, second = np.array([(middle, edge), (edge, 2000), (middle, 2000)]).T
+    found = sides_of_planes(xyz, normals, np.full(2200, 3.0), np.ones(2200), (first, second), may_be_bent=True)
+    assert (found.tolist() == [1, -1, -1]) == on
+
+
 def test_normals_of_depth_are_exact_on_planes_and_missing_at_gaps():
     K = np.array([[150.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
     forward = np.array([0.5, -0.4, -1.0]) / np.linalg.norm([0.5, -0.4, -1.0])

@@ -56,7 +56,7 @@ def starting_points(
         capture: the capture that is trained on.
         point_ids: (M,) int64 object ID of each of its points, 0 if it belongs to none.
         plan: the plan.
-        on_planes: points on planes without features, if the plan adds them; if it adds dense points, they are found anew
+        on_planes: points on planes without features, if the plan adds them; with dense points, they are found anew,
             and left out where these suffice.
         seed: of random numbers.
         reporter: receives progress, how many points are placed, and the objects that stay without any.
