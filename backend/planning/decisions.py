@@ -31,7 +31,7 @@ from .coverage import (
 )
 from .plane_points import LEAST as LEAST_ON_PLANES
 from .plane_points import PlanePoints, find_plane_points
-from .surroundings import LEAST, Surroundings, find_surroundings
+from .surroundings import LEAST, Surroundings, find_surroundings, measure_surroundings
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -365,12 +365,10 @@ def _dense_points(context: PlanningContext) -> Decision | None:
         return Decision("dense-points", what, None, "it requires reading all photos, which training does first")
     capture = planned_capture(context.capture, context.plan)
     # Points on planes are no reason to look for none there, since they are less exact.
-    sky = (
-        find_surroundings(capture, NO_POINTS, context.check)
-        if context.plan.does("plane-points")
-        else context.surroundings
-    )
-    vacant = max(vacancy(capture, context.check) - sky.fraction, 0.0)
+    of_sky = context.surroundings.fraction
+    if context.plan.does("plane-points"):
+        of_sky = measure_surroundings(capture, context.check)
+    vacant = max(vacancy(capture, context.check) - of_sky, 0.0)
     why = f"{vacant:.0%} of the photos' area, without the sky, has no points; the threshold is {VACANT:.0%}"
     return Decision("dense-points", what, vacant >= VACANT, why)
 

@@ -16,7 +16,7 @@ from scipy import ndimage
 from ..capture import Capture
 from ..shared.stopping import Check, proceed
 from ..training.extent import SURROUNDINGS, extent_of
-from .coverage import occupied_cells
+from .coverage import cells_of, occupied_cells
 
 SPACING = float(np.radians(2.0))
 """Angle between neighboring directions."""
@@ -52,6 +52,25 @@ class Surroundings(NamedTuple):
     uniform: bool
 
 
+class _Directions(NamedTuple):
+    """Directions (n, 3) from the cameras, and what views show there.
+
+    Attributes:
+        unit: (n, 3) all directions.
+        vacant: (n,) int64, the number of views that show no points there.
+        chosen: (n,) bool, those that belong to surroundings without points.
+        shown: for each examined view its index, the directions (m,) where it shows no points, and their columns and
+            rows (m,).
+        fraction: fraction of the photos' pixels that shows the chosen ones.
+    """
+
+    unit: np.ndarray
+    vacant: np.ndarray
+    chosen: np.ndarray
+    shown: list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]
+    fraction: float
+
+
 def find_surroundings(capture: Capture, more: np.ndarray, check: Check = proceed) -> Surroundings:
     """Find the directions in which the training views of a capture show surroundings without points.
 
@@ -66,33 +85,53 @@ def find_surroundings(capture: Capture, more: np.ndarray, check: Check = proceed
     Raises:
         InputError: an image or a mask cannot be read.
     """
+    found = _directions(capture, more, check)
+    total = np.zeros((len(found.unit), 3))
+    for index, free, x, y in found.shown:
+        check()
+        of_chosen = found.chosen[free]
+        if of_chosen.any():
+            total[free[of_chosen]] += capture.image(index)[y[of_chosen], x[of_chosen]]
+    extent = extent_of(capture)
+    distance = SURROUNDINGS * extent.radius
+    rgb = total[found.chosen] / found.vacant[found.chosen, None]
+    return Surroundings(
+        extent.center + distance * found.unit[found.chosen],
+        rgb.round().astype(np.uint8),
+        distance * SPACING,
+        found.fraction,
+        not len(rgb) or float(rgb.std(0).mean()) <= _UNIFORM,
+    )
+
+
+def measure_surroundings(capture: Capture, check: Check = proceed) -> float:
+    """Return the fraction of the photos' pixels that shows surroundings without points of the capture.
+
+    The arguments are those of `find_surroundings`; no image is read.
+    """
+    return _directions(capture, np.zeros((0, 3)), check).fraction
+
+
+def _directions(capture: Capture, more: np.ndarray, check: Check) -> _Directions:
+    """Return in which directions views show no points; the arguments are those of `find_surroundings`."""
     train, xyz = list(capture.train_indices), np.concatenate([capture.points.xyz, more])
     views = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _VIEWS)).astype(int))]
-    directions = _sphere(SPACING)
-    inside, vacant = np.zeros(len(directions), np.int64), np.zeros(len(directions), np.int64)
-    total = np.zeros((len(directions), 3))
-    shown = []
+    unit = _sphere(SPACING)
+    inside, vacant = np.zeros(len(unit), np.int64), np.zeros(len(unit), np.int64)
+    shown, sizes = [], []
     for index in views:
         check()
         view, free = capture.views[index], _vacant_cells(capture, index, xyz)
-        seen, x, y = view.pixels_of(directions @ view.viewmat[:3, :3].T)
-        here = free[y * free.shape[0] // view.height, x * free.shape[1] // view.width]
+        seen, rows, columns = cells_of(view, unit @ view.viewmat[:3, :3].T, free.shape)
+        _, x, y = view.pixels_of(unit @ view.viewmat[:3, :3].T)
+        here = free[rows, columns]
         inside[seen] += 1
         vacant[seen[here]] += 1
-        total[seen[here]] += capture.image(index)[y[here], x[here]]
-        shown.append((seen, here))
+        shown.append((index, seen[here], x[here], y[here]))
+        sizes.append(len(seen))
     chosen = (vacant >= _FEWEST) & (vacant >= _VACANT * inside)
-    fractions = [chosen[seen[here]].sum() / len(seen) for seen, here in shown if len(seen)]
-    extent = extent_of(capture)
-    distance = SURROUNDINGS * extent.radius
-    rgb = total[chosen] / vacant[chosen, None]
-    return Surroundings(
-        extent.center + distance * directions[chosen],
-        rgb.round().astype(np.uint8),
-        distance * SPACING,
-        float(np.mean(fractions)) if fractions else 0.0,
-        not len(rgb) or float(rgb.std(0).mean()) <= _UNIFORM,
-    )
+    fractions = [chosen[free].sum() / size for (_, free, _, _), size in zip(shown, sizes, strict=True) if size]
+    return _Directions(unit, vacant, chosen, shown, float(np.mean(fractions)) if fractions else 0.0)
 
 
 def _sphere(spacing: float) -> np.ndarray:

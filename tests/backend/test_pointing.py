@@ -707,7 +707,7 @@ def test_planes_need_no_vote(monkeypatch, detail) -> None:
     first, second = right[graph.edges.first], right[graph.edges.second]
     counts = []
     for sides in (np.zeros(len(first)), np.where(first == second, 0, -1)):
-        monkeypatch.setattr("backend.pointing.proposals.sides_of_planes", lambda *_, sides=sides: sides)
+        monkeypatch.setattr("backend.pointing.proposals.sides_of_planes", lambda *_, sides=sides, **_options: sides)
         found = find_objects(graph, try_regions(graph, lambda done, total: None), detail)
         largest = [np.bincount(found[table & half]).argmax() for half in (right, ~right)]
         counts.append(len(set(largest)))

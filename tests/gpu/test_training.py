@@ -42,6 +42,9 @@ class View:
     viewmat: np.ndarray
     camera_id: int = 1
 
+    def to_camera(self, xyz: np.ndarray) -> np.ndarray:
+        return xyz @ self.viewmat[:3, :3].T + self.viewmat[:3, 3]
+
     def pixels_of(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         z = np.maximum(xyz[:, 2], 1e-9)
         x, y = (xyz[:, i] / z * self.K[i, i] + self.K[i, 2] for i in (0, 1))
