@@ -31,6 +31,9 @@ _SHOWN_ELSEWHERE = 0.8
 _MOST_VIEWS = 150
 """Number of views, spread evenly, in which points are counted."""
 
+_MOST_EXAMINED = 60
+"""Number of views in which surfaces, or what is around them, are looked for."""
+
 _FEW_POINTS = 2000
 """Number of points, spread evenly, that are looked for first."""
 
@@ -251,6 +254,13 @@ def vacancy(capture: Capture, check: Check = proceed) -> float:
         check()
         fractions.append(1.0 - occupied_cells(capture.views[index], xyz).mean())
     return float(np.mean(fractions)) if fractions else 0.0
+
+
+def examined_views(capture: Capture) -> list[int]:
+    """Return the indices of at most `_MOST_EXAMINED` training views, spread evenly."""
+    train = list(capture.train_indices)
+    count = min(len(train), _MOST_EXAMINED)
+    return [train[i] for i in np.unique(np.linspace(0, len(train) - 1, count).astype(int))]
 
 
 def occupied_cells(view: View, xyz: np.ndarray) -> np.ndarray:

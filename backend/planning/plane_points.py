@@ -20,13 +20,10 @@ from ..capture import Capture
 from ..shared.stopping import Check, proceed
 from ..stereo.scene_planes import ScenePlane, find_planes, on_plane
 from ..stereo.surface_normals import measure_normals
-from .coverage import CELLS, cells_of, occupied_cells
+from .coverage import CELLS, cells_of, examined_views, occupied_cells
 
 LEAST = 0.1
 """Fraction of the photos' area that shows planes without features from which on points on them are worth it."""
-
-_VIEWS = 60
-"""Largest number of views that are examined."""
 
 _NEIGHBORS, _FEWEST_POINTS, _MOST_POINTS = 16, 50, 100_000
 """Number of nearest points that the normal of a point is measured on; fewest points of a plane; and largest number of
@@ -35,9 +32,8 @@ points, spread evenly, that planes are looked for among."""
 _BEYOND = 1.0
 """How far a plane is looked for beyond its points, relative to their extent."""
 
-_SPACING, _MOST_PLACES = 1.0, 40_000
-"""Distance between points that are added, in cells of the views; and largest number of places that are looked at on a
-plane, since otherwise these are farther apart."""
+_MOST_PLACES = 40_000
+"""Largest number of places that are looked at on a plane; they are a cell of the views apart, or farther with more."""
 
 _FEWEST_VIEWS, _VACANT = 3, 0.5
 """Fewest views that show a place, and smallest fraction of them without points there."""
@@ -117,13 +113,12 @@ def find_plane_points(capture: Capture, more: np.ndarray, check: Check = proceed
         check: called at intervals; ends the work by an exception once the user wants to stop.
 
     Returns:
-        The points, those of the largest plane first; xyz is empty if there are none.
+        The points, a plane after the other; xyz is empty if there are none.
 
     Raises:
         InputError: an image cannot be read.
     """
-    train, xyz = list(capture.train_indices), np.concatenate([capture.points.xyz, more])
-    views = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _VIEWS)).astype(int))]
+    views, xyz = examined_views(capture), np.concatenate([capture.points.xyz, more])
     found, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     if len(xyz) < max(_NEIGHBORS, _FEWEST_POINTS) or not views:
         return PlanePoints(found[0], colors[0], 0.0)
@@ -131,7 +126,7 @@ def find_plane_points(capture: Capture, more: np.ndarray, check: Check = proceed
     cell = float(np.median([max(view.width, view.height) / CELLS / view.K[0, 0] for view in capture.views]))
     shown = [_Shown(capture, index, xyz) for index in views]
     before = float(np.mean([each.occupied.mean() for each in shown]))
-    for places in _by_density(xyz[:: -(-len(xyz) // _MOST_POINTS)], centers, _SPACING * cell):
+    for places in _by_density(xyz[:: -(-len(xyz) // _MOST_POINTS)], centers, cell):
         check()
         kept, rgb = _surface(capture, shown, places, check)
         found.append(places.xyz[kept])
@@ -182,12 +177,7 @@ def _places(plane: ScenePlane, xyz: np.ndarray, spacing: float) -> _Places | Non
     spacing = max(spacing, float(np.sqrt(np.prod(high - low) / _MOST_PLACES)))
     at = np.stack(np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(low, high, strict=True))), -1)
     between = (at @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0).all(-1)
-    return _Places(plane.offset * plane.normal + _without(plane.center, plane.normal) + at @ axes, between)
-
-
-def _without(vector: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return a vector (3,) without its part in a unit direction (3,)."""
-    return vector - (vector @ direction) * direction
+    return _Places(plane.center + at @ axes, between)
 
 
 def _surface(capture: Capture, shown: Sequence[_Shown], places: _Places, check: Check) -> tuple[np.ndarray, np.ndarray]:

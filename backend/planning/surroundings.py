@@ -16,16 +16,13 @@ from scipy import ndimage
 from ..capture import Capture
 from ..shared.stopping import Check, proceed
 from ..training.extent import SURROUNDINGS, extent_of
-from .coverage import cells_of, occupied_cells
+from .coverage import cells_of, examined_views, occupied_cells
 
 SPACING = float(np.radians(2.0))
 """Angle between neighboring directions."""
 
 LEAST = 0.02
 """Smallest fraction of the photos' pixels that shows surroundings without points, if there are any."""
-
-_VIEWS = 60
-"""Largest number of views that are examined."""
 
 _VACANT, _FEWEST = 0.5, 2
 """Smallest fraction of the views of a direction that have nothing there, and smallest number of them."""
@@ -114,16 +111,16 @@ def measure_surroundings(capture: Capture, check: Check = proceed) -> float:
 
 def _directions(capture: Capture, more: np.ndarray, check: Check) -> _Directions:
     """Return in which directions views show no points; the arguments are those of `find_surroundings`."""
-    train, xyz = list(capture.train_indices), np.concatenate([capture.points.xyz, more])
-    views = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _VIEWS)).astype(int))]
+    views, xyz = examined_views(capture), np.concatenate([capture.points.xyz, more])
     unit = _sphere(SPACING)
     inside, vacant = np.zeros(len(unit), np.int64), np.zeros(len(unit), np.int64)
     shown, sizes = [], []
     for index in views:
         check()
         view, free = capture.views[index], _vacant_cells(capture, index, xyz)
-        seen, rows, columns = cells_of(view, unit @ view.viewmat[:3, :3].T, free.shape)
-        _, x, y = view.pixels_of(unit @ view.viewmat[:3, :3].T)
+        local = unit @ view.viewmat[:3, :3].T
+        seen, rows, columns = cells_of(view, local, free.shape)
+        _, x, y = view.pixels_of(local)
         here = free[rows, columns]
         inside[seen] += 1
         vacant[seen[here]] += 1
