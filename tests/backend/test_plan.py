@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 
 from backend.capture import load_capture, sharpness
+from backend.commands.training import points
 from backend.labels import corrections, read_points
 from backend.labels.mask_points import place_points
 from backend.model.checkpoint import load_checkpoint
@@ -103,7 +104,7 @@ def test_points_are_looked_for_where_photos_have_none(write_capture, tmp_path):
     assert decide(PlanningContext(many, Choices(), resumed=begun))["dense-points"].done, "as the training began"
 
 
-def test_planes_without_features_get_points(write_capture, tmp_path, run_command):
+def test_planes_without_features_get_points(write_capture, tmp_path, run_command, monkeypatch):
     """Points on the edges of a plain floor below the spheres; the plan says how much of the photos it fills."""
     scene = write_capture(views=9, size=(64, 48), points=200, masks=False)
     rng = np.random.default_rng(0)
@@ -118,13 +119,20 @@ def test_planes_without_features_get_points(write_capture, tmp_path, run_command
     begun = Plan((Decision("plane-points", "", False, ""),))
     assert not decide(PlanningContext(capture, Choices(), resumed=begun))["plane-points"].done, "as the training began"
     assert decide(PlanningContext(capture, Choices(), resumed=Plan()))["plane-points"] is None, "of a former version"
-    said = {}
-    for name, words in (("with", ()), ("without", ("--leave-out", "plane-points"))):
-        result = run_command("train", scene.folder, "--out", tmp_path / name, "--steps", 1, *SMALL, *words)
-        assert result.code == 0, result
-        said[name] = result.out
-    assert "points added on planes without features" in said["with"]
-    assert "points added on planes without features" not in said["without"]
+    train = ("train", scene.folder, *SMALL)
+    for name, added, words in (
+        ("with", True, ()),
+        ("without", False, ("--leave-out", "plane-points")),
+        ("dense points suffice", False, ()),
+        ("wanted", True, ("--keep", "plane-points")),
+    ):
+        monkeypatch.setattr(points, "LEAST", 1.0 if name in ("dense points suffice", "wanted") else 0.1)
+        result = run_command(*train, "--steps", 1, "--out", tmp_path / name, *words)
+        assert result.code == EXIT_DONE, result
+        assert ("points added on planes without features" in result.out) is added
+        decision = read_plan(tmp_path / name / "plan.json")["plane-points"]
+        assert decision.done is added and ("once dense points are added" in decision.why) is (name != "without")
+        assert run_command(*train, "--steps", 2, "--out", tmp_path / name, *words).code == EXIT_DONE, "resumed"
 
 
 # --- basis of decisions ----------------------------------------------------------------------------------------------

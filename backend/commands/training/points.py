@@ -23,6 +23,9 @@ DENSE = "dense"
 _SECONDS = 0.4
 """Typical time of the search for dense points in a photo."""
 
+PLANES = "plane-points"
+"""Key of the decision about points on planes without features."""
+
 PLACE = "place-points"
 """Name of the placing of points of objects that have none, among the parts of a command."""
 
@@ -36,10 +39,12 @@ class StartingPoints(NamedTuple):
     Attributes:
         seeds: (M,) bool, the points of the capture that are used.
         more: further points with their objects, or None.
+        plan: the plan, revised by what was found.
     """
 
     seeds: np.ndarray
     more: MaskPoints | None
+    plan: Plan
 
 
 def starting_points(
@@ -57,7 +62,7 @@ def starting_points(
         point_ids: (M,) int64 object ID of each of its points, 0 if it belongs to none.
         plan: the plan.
         on_planes: points on planes without features, if the plan adds them; with dense points, they are found anew,
-            and left out where these suffice.
+            and left out where these suffice, unless the user wants them.
         seed: of random numbers.
         reporter: receives progress, how many points are placed, and the objects that stay without any.
 
@@ -71,7 +76,10 @@ def starting_points(
         parts.append(dense)
         if on_planes is not None:
             found = find_plane_points(capture, dense.xyz, reporter.check)
-            on_planes = found if found.fraction >= LEAST else None
+            shown = f"{found.fraction:.1%} of the photos' area shows planes whose points are elsewhere"
+            why = f"{shown} once dense points are added; the threshold is {LEAST:.0%}"
+            plan = plan.revised(PLANES, found.fraction >= LEAST, why)
+            on_planes = found if plan.does(PLANES) else None
     if on_planes is not None:
         parts.append(_voted(capture, on_planes.xyz, on_planes.rgb, reporter))
         reporter.status(f"{len(on_planes.xyz):,} points added on planes without features")
@@ -80,7 +88,7 @@ def starting_points(
     if missing:
         parts.append(_place(capture, missing, seed, reporter))
     parts = [part for part in parts if len(part.ids)]
-    return StartingPoints(seeds, MaskPoints(*map(np.concatenate, zip(*parts, strict=True))) if parts else None)
+    return StartingPoints(seeds, MaskPoints(*map(np.concatenate, zip(*parts, strict=True))) if parts else None, plan)
 
 
 def _dense(capture: Capture, seeds: np.ndarray, reporter: StoppingReporter) -> tuple[MaskPoints, np.ndarray]:

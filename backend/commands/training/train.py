@@ -212,7 +212,7 @@ def _begin(
     else:
         far = DistantPoints(*context.surroundings[:3]) if plan.does("surroundings") else None
         on_planes = context.plane_points if plan.does("plane-points") else None
-        seeds, more = starting_points(planned, context.point_ids, plan, on_planes, options.seed, reporter)
+        seeds, more, plan = starting_points(planned, context.point_ids, plan, on_planes, options.seed, reporter)
         # Once for both trainers that may be started.
         detail = measure_detail(planned, seeds, more, reporter.check)
         start = functools.partial(

@@ -109,6 +109,11 @@ class Plan:
         """Return the plan without a decision, which is to be made anew."""
         return Plan(tuple(decision for decision in self.decisions if decision.key != key))
 
+    def revised(self, key: str, planned: bool, why: str) -> Plan:
+        """Return the plan with a decision that later facts changed; the user's override stays."""
+        changed = (replace(own, planned=planned, why=why) if own.key == key else own for own in self.decisions)
+        return Plan(tuple(changed))
+
     def overridden(self, keep: Iterable[str], leave_out: Iterable[str]) -> Plan:
         """Return the plan with the user's overrides.
 
