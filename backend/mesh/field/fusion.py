@@ -2,7 +2,8 @@
 
 In each view, a point in front of the visible surface is outside the object; a point near the visible surface of the
 object has a signed distance from it; and a point behind the visible surface, whether of this or another object, is
-unknown. A point that is unknown in all views is inside if the observed surface surrounds it (winding number).
+unknown. A point that is unknown in all views is inside if the observed surface surrounds it (winding number), or if it
+is just below that surface.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from .blocks import AROUND, SAMPLES, SIDE, Blocks, distinct
 from .holes import Patches
 from .integrate import Observation, add, may_add, prepare_observation, visible_depth
 from .marching import compact, march, parts
+from .skin import Skin
 from .winding import Winding
 
 RESOLUTION = 256
@@ -280,7 +282,7 @@ class _Fusion:
         vertices, faces = largest_parts(vertices, faces)
         if not len(faces):
             raise NoSurface("The views see too little of it, or do not agree on where it is.")
-        self.patches = Patches(vertices, faces)
+        self.patches, self.skin = Patches(vertices, faces), Skin(vertices, faces)
         return Winding(
             np.concatenate([vertices, self.patches.points]),
             np.concatenate([faces, self.patches.faces + len(vertices)]),
@@ -296,7 +298,7 @@ class _Fusion:
         self.reporter.progress(2 * count if self.rounds else count + views, 2 * count + _FILLING)
 
     def _finished(self, coords: np.ndarray, total: np.ndarray, weights: np.ndarray, winding: Winding) -> np.ndarray:
-        """Return the distances in voxels; unobserved ones are computed from the winding number.
+        """Return the distances in voxels; unobserved ones are computed from the winding number, except in the skin.
 
         What reaches the border of the box ends there.
         """
@@ -306,6 +308,7 @@ class _Fusion:
         size = (self.extent.high - self.extent.low).mean() / self.voxel
         closing = np.clip((0.5 - winding.at(coords, unsure)) * size, -reach, reach)
         self.patches.thicken(coords, unsure, 0.8 * self.back / self.voxel, closing)
+        self.skin.keep(coords, self._seen(total, weights) & (total < 0) & (closing > 0), values, closing)
         share = np.minimum(weights / _SURE, 1)
         values = share * values + (1 - share) * closing
         return _nudged(np.where(self._at_border(coords), np.maximum(values, 0), values))

@@ -22,7 +22,8 @@ _LARGEST = 400
 _RIM = 100
 """Approximate number of rim points from which the height of a patch is interpolated."""
 
-_LOCAL = np.stack(np.unravel_index(np.arange(SAMPLES), (SIDE,) * 3), 1)
+LOCAL = np.stack(np.unravel_index(np.arange(SAMPLES), (SIDE,) * 3), 1)
+"""Positions of the samples in a block, (512, 3)."""
 
 
 class Patches:
@@ -53,7 +54,7 @@ class Patches:
         away, _ = self._tree.query(coords * SIDE + 0.5 * (SIDE - 1), distance_upper_bound=SIDE + thickness)
         for b in np.flatnonzero(np.isfinite(away)):
             place = np.flatnonzero(wanted[b])
-            samples = coords[b] * SIDE + _LOCAL[place]
+            samples = coords[b] * SIDE + LOCAL[place]
             off, nearest = self._tree.query(samples)
             across = samples - self.points[nearest]
             height = (across * self.normals[nearest]).sum(1)
