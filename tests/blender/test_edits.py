@@ -1824,7 +1824,7 @@ def test_export_of_meshes_tells_of_fills(ground, root, tmp_path, told):
     bpy.ops.objectgs.restore_object(object="1")
     bpy.ops.objectgs.export_meshes(filepath=out, format="obj")
     first, second = (text for text, _ in told if text.startswith(f"Wrote {out}"))
-    assert first.endswith("Meshes do not show what fills the holes of removed and moved objects; splats do.")
+    assert first.endswith("are not in meshes, which continue flat surfaces on their own.")
     assert "holes" not in second
 
 

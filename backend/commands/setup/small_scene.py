@@ -18,6 +18,7 @@ from ...mesh.field.fusion import fuse
 from ...mesh.refine import refine
 from ...mesh.surface import NoSurface, Surface
 from ...mesh.texture.bake import bake_texture
+from ...mesh.texture.completion import complete
 from ...mesh.texture.unwrap import unwrap
 from ...mesh.views import Views
 from ...model.draw import draw
@@ -101,6 +102,9 @@ class SmallScene:
         faces = np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]], np.int32)
         shape = refine(Surface(corners, faces, np.zeros(4, bool)), views, [1], reporter("refine"))
         bake_texture(shape, unwrap(shape, 64), 64, views, [1], reporter=reporter("bake"))
+        hidden = np.zeros((24, 24), bool)
+        hidden[10:12, 10:12] = True
+        complete(np.zeros((24, 24, 3)), ~hidden, hidden)
 
 
 def _write_capture(folder: Path) -> None:

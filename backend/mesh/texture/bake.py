@@ -14,6 +14,7 @@ from ...shared.events import Reporter
 from ..surface import Surface, neighbors, vertex_normals
 from ..views import Views
 from .atlas import Texels, fill, find_texels, interpolate
+from .hidden import Textured, complete_hidden_parts
 from .leveling import level
 from .photos import Photo, Photos, Samples, add_photo, blend
 
@@ -86,7 +87,8 @@ def bake_texture(
     """Bake the photos into a texture.
 
     Each texel is blended from the photos that show it best. Texels that are visible in no photo get the colors of the
-    splats there; where these are hardly seen, too, colors are extrapolated.
+    splats there; where these are hardly seen, too, colors are extrapolated, and flat parts get the detail of their
+    surroundings.
 
     Args:
         surface: The surface in scene units.
@@ -112,6 +114,7 @@ def bake_texture(
     steps = [(first, min(rows, size - first)) for first in range(0, size, rows)]
     passes = (1 + len(steps)) * len(views.indices)
     no_offsets = np.zeros((len(vertices), 3), np.float32)
+    shown, counts = np.zeros((2, len(faces)))
     offsets = level(photos, normals, lambda done: reporter.progress(done, passes))
     for step, (first, count) in enumerate(steps):
         texels = find_texels(uvs, size, first, count)
@@ -130,6 +133,8 @@ def bake_texture(
         color, seen = blend(samples)
         texture.reshape(-1, 3)[texels.indices] = np.rint(color * 255)
         state.ravel()[texels.indices] = np.where(seen, _SEEN, _UNSEEN)
+        counts += np.bincount(texels.face, minlength=len(faces))
+        shown += np.bincount(texels.face, seen, len(faces))
         _add_texels(faces, texels.face, texels.weights, color, seen, photo_colors.total, photo_colors.weight)
     vertex_colors = _extrapolate(splats, vertices, faces, np.full(3, 0.5, np.float32))
     # What no photo may color, such as thin parts, has the color of its splats where these are seen.
@@ -137,7 +142,15 @@ def bake_texture(
     photo_colors.total[of_splats] = vertex_colors[of_splats]
     photo_colors.weight[of_splats] = 1
     base = _extrapolate(photo_colors, vertices, faces, vertex_colors)
-    _complete(texture, state, base, faces, uvs, steps)
+    _continue_smoothly(texture, state, base, faces, uvs, steps)
+    surface_of_texels = Textured(
+        vertices, faces, np.where(counts > 0, shown / np.maximum(counts, 1), 1.0),
+        lambda: (find_texels(uvs, size, first, count) for first, count in steps), int(counts.sum()),
+    )  # fmt: skip
+    complete_hidden_parts(
+        texture, state == _SEEN, surface_of_texels, lambda done: reporter.progress(passes - 1 + done, passes)
+    )
+    _fill_between_charts(texture, state)
     return texture, np.rint(np.clip(vertex_colors, 0, 1) * 255).astype(np.uint8)
 
 
@@ -236,25 +249,28 @@ def _extrapolate(mean: _Mean, vertices: np.ndarray, faces: np.ndarray, otherwise
     return out
 
 
-def _complete(
+def _continue_smoothly(
     texture: np.ndarray, state: np.ndarray, base: np.ndarray, faces: np.ndarray, uvs: np.ndarray, steps: list
 ) -> None:
-    """Color the texels that are visible in no photo, and those between the charts, in place.
+    """Color the texels that are visible in no photo, in place.
 
-    An unseen texel gets the color `base`, interpolated between the vertices, plus the smoothly extrapolated difference
-    of the seen texels from it, to avoid visible seams.
+    Such a texel gets the color `base`, interpolated between the vertices, plus the smoothly extrapolated difference of
+    the seen texels from it, to avoid visible seams.
     """
-    size = len(state)
-    if (state == _UNSEEN).any():
-        smooth = np.zeros((size, size, 3), np.float32)
-        for first, count in steps:
-            texels = find_texels(uvs, size, first, count)
-            smooth.reshape(-1, 3)[texels.indices] = _on_faces(base, faces, texels)
-        difference = texture.astype(np.float32) / 255 - smooth
-        fill(difference, state == _SEEN)
-        unseen = state == _UNSEEN
-        texture[unseen] = np.rint(np.clip(smooth[unseen] + difference[unseen], 0, 1) * 255)
-        del smooth, difference
+    size, unseen = len(state), state == _UNSEEN
+    if not unseen.any():
+        return
+    smooth = np.zeros((size, size, 3), np.float32)
+    for first, count in steps:
+        texels = find_texels(uvs, size, first, count)
+        smooth.reshape(-1, 3)[texels.indices] = _on_faces(base, faces, texels)
+    difference = texture.astype(np.float32) / 255 - smooth
+    fill(difference, state == _SEEN)
+    texture[unseen] = np.rint(np.clip(smooth[unseen] + difference[unseen], 0, 1) * 255)
+
+
+def _fill_between_charts(texture: np.ndarray, state: np.ndarray) -> None:
+    """Color the texels that are on no chart, in place."""
     values = texture.astype(np.float32)
     fill(values, state != _EMPTY)
     np.rint(values, out=values)

@@ -131,7 +131,10 @@ def summary(root: bpy.types.Collection, out: Path, files: list[Path], ids: list[
         for part in scene.parts_of(collection)
         if scene.kind_of(part) == "splats"
     ):
-        text += " Meshes do not show what fills the holes of removed and moved objects; splats do."
+        text += (
+            " The splats that fill the holes of removed and moved objects are not in meshes, which continue flat "
+            "surfaces on their own."
+        )
     return text
 
 
