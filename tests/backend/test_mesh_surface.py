@@ -481,14 +481,16 @@ def test_occluded_space_is_unknown():
     assert volume(surface) == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=0.12)
 
 
-def test_touching_objects_are_separated():
+@pytest.mark.parametrize("finer", [1, 2])
+def test_touching_objects_are_separated(finer):
     left, right = box((-0.6, -0.3, -0.3), (0.0, 0.3, 0.3)), box((0.0, -0.3, -0.3), (0.6, 0.3, 0.3))
-    views = ExactViews([left, right], around(14, heights=(-1.5, 0.2, 1.6)))
+    cameras = around(14, heights=(-1.5, 0.2, 1.6), width=64 * finer, height=48 * finer, focal=60.0 * finer)
+    views = ExactViews([left, right], cameras)
     surfaces = [extract(fuse(views, [c])) for c in (0, 1)]
     for surface in surfaces:
         assert_valid_surface(surface)
         assert volume(surface) == pytest.approx(0.6**3, rel=0.08)
-    two_pixels = 2 * 2.5 / 60
+    two_pixels = 2 * 2.5 / (60 * finer)
     assert surfaces[0].vertices[:, 0].max() < two_pixels and surfaces[1].vertices[:, 0].min() > -two_pixels
     both = extract(fuse(views, [0, 1]))
     assert_valid_surface(both)

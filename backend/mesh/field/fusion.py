@@ -8,6 +8,7 @@ is just below that surface.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -237,8 +238,12 @@ class _Fusion:
         points = (self.extent.points - self.origin) / self.voxel
         coarse = distinct(np.floor(points).astype(np.int64))
         offset = self.reach / self.voxel
-        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * offset
-        found = [distinct(np.floor((coarse + 0.5 + corner) / SIDE).astype(np.int64)) for corner in corners]
+        # At most a block apart, so that none in between is missed.
+        steps = np.linspace(-offset, offset, 1 + int(np.ceil(2 * offset / SIDE)))
+        found = [
+            distinct(np.floor((coarse + 0.5 + step) / SIDE).astype(np.int64))
+            for step in itertools.product(steps, repeat=3)
+        ]
         return self._in_box(distinct(np.concatenate(found)))
 
     def _in_box(self, coords: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from .atlas import Texels, fill, interpolate
 from .completion import complete
 
-_MOST, _SMALLEST = 50, 12
+_MOST, _SMALLEST = 100, 12
 """Largest number of parts, the largest first, and the side in texels of the smallest one."""
 
 _FLAT, _ALIGNED, _OFF = 0.8, 0.7, 0.15
@@ -70,7 +70,7 @@ class _Part:
 
     Attributes:
         on_plane: (F,) bool, faces of the part and of its surroundings.
-        color: (rows, columns, 3) float64, means of the texels that photos show, from 0 to 1.
+        color: (rows, columns, 3) float32, sums of the texels that photos show, from 0 to 1.
         known, hidden, own: (rows, columns) bool; cells with such texels, with others, and with others of the part.
     """
 
@@ -89,7 +89,7 @@ class _Part:
         self._is_own = np.zeros(len(surface.faces), bool)
         self._is_own[faces] = True
         shape = tuple(np.ceil((high - self._low) / self._cell).astype(int) + 1)
-        self.color, self._count = np.zeros((*shape, 3)), np.zeros(shape)
+        self.color, self._count = np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32)
         self.hidden, self.own = np.zeros(shape, bool), np.zeros(shape, bool)
 
     def places(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
