@@ -23,9 +23,6 @@ DENSE = "dense"
 _SECONDS = 0.4
 """Typical time of the search for dense points in a photo."""
 
-PLANES = "plane-points"
-"""Key of the decision about points on planes without features."""
-
 PLACE = "place-points"
 """Name of the placing of points of objects that have none, among the parts of a command."""
 
@@ -78,8 +75,8 @@ def starting_points(
             found = find_plane_points(capture, dense.xyz, reporter.check)
             shown = f"{found.fraction:.1%} of the photos' area shows planes whose points are elsewhere"
             why = f"{shown} once dense points are added; the threshold is {LEAST:.0%}"
-            plan = plan.revised(PLANES, found.fraction >= LEAST, why)
-            on_planes = found if plan.does(PLANES) else None
+            plan = plan.revised("plane-points", found.fraction >= LEAST, why)
+            on_planes = found if plan.does("plane-points") else None
     if on_planes is not None:
         parts.append(_voted(capture, on_planes.xyz, on_planes.rgb, reporter))
         reporter.status(f"{len(on_planes.xyz):,} points added on planes without features")

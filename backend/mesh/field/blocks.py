@@ -10,6 +10,9 @@ SIDE = 8
 """Number of samples along a block's edge."""
 SAMPLES = SIDE**3
 
+LOCAL = np.stack(np.unravel_index(np.arange(SAMPLES), (SIDE,) * 3), 1)
+"""(512, 3): the positions of the samples in a block."""
+
 AROUND = np.array([o for o in itertools.product((-1, 0, 1), repeat=3) if o != (0, 0, 0)], np.int64)
 """(26, 3): the offsets to the neighbors of a block."""
 

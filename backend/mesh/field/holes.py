@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from skimage.draw import polygon2mask
 
-from .blocks import SAMPLES, SIDE
+from .blocks import LOCAL, SIDE
 
 _FACING = 0.6
 """Smallest cosine between the normals of the surface around a hole and the normal of the hole's plane."""
@@ -21,9 +21,6 @@ _LARGEST = 400
 """Smallest number of edges of a hole's rim, and largest number of voxels across a hole."""
 _RIM = 100
 """Approximate number of rim points from which the height of a patch is interpolated."""
-
-LOCAL = np.stack(np.unravel_index(np.arange(SAMPLES), (SIDE,) * 3), 1)
-"""Positions of the samples in a block, (512, 3)."""
 
 
 class Patches:
@@ -63,12 +60,17 @@ class Patches:
             values[b, place] = np.minimum(values[b, place], slab)
 
 
-def _loops(faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Find the boundary loops of a surface: the vertices in the direction of the faces, and the face of each edge."""
+def rim_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges (3 F, 2) of faces (F, 3), each in its face's direction, and the indices of those at the rim."""
     edges = np.stack([faces, np.roll(faces, -1, 1)], -1).reshape(-1, 2).astype(np.int64)
     size = int(faces.max(initial=0)) + 1
     there, back = edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]
-    rim = np.flatnonzero(~np.isin(there, back))
+    return edges, np.flatnonzero(~np.isin(there, back))
+
+
+def _loops(faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Find the boundary loops of a surface: the vertices in the direction of the faces, and the face of each edge."""
+    edges, rim = rim_edges(faces)
     after: dict[int, list[int]] = {}
     for edge in rim.tolist():
         after.setdefault(int(edges[edge, 0]), []).append(edge)

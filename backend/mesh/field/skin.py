@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..surface import vertex_normals
-from .blocks import SIDE
-from .holes import LOCAL
+from .blocks import LOCAL, SIDE
+from .holes import rim_edges
 
 _BESIDE = 0.7
 """Largest distance in voxels along the surface from its nearest vertex; vertices are about as far apart."""
@@ -27,9 +27,8 @@ class Skin:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self._tree, self._vertices = cKDTree(vertices), vertices
         self._normals = vertex_normals(vertices, faces)
-        edges = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), 1)
-        edges, times = np.unique(edges, axis=0, return_counts=True)
-        rim = np.unique(edges[times == 1])
+        edges, at_rim = rim_edges(faces)
+        rim = np.unique(edges[at_rim])
         self._inner = np.ones(len(vertices), bool)
         if len(rim):
             self._inner = cKDTree(vertices[rim]).query(vertices, workers=-1)[0] > _EDGE
